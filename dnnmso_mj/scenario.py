@@ -1,0 +1,417 @@
+"""The typed scenario: everything that decides a run, with units, ranges and the paper's values.
+
+Loading a file with line numbers and messages for people is `dnnmso_mj.loading`'s work; this module
+holds only the shapes and the rules that tie one value to another.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    WithJsonSchema,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+MAX_TICKS = 100_000_000
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _vector(value: Any) -> Any:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return (value,) if is_number else _tuple(value)
+
+
+def _number_or_list(item: dict[str, Any]) -> WithJsonSchema:
+    return WithJsonSchema({"anyOf": [item, {"type": "array", "items": item, "minItems": 1}]})
+
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Vector = Annotated[tuple[Finite, ...], BeforeValidator(_tuple), Field(min_length=1)]
+Positives = Annotated[tuple[Positive, ...], BeforeValidator(_tuple), Field(min_length=1)]
+Matrix = Annotated[tuple[Vector, ...], BeforeValidator(_tuple), Field(min_length=1)]
+# One number for all entries, or one for each; kept as a tuple and widened by `expand`.
+PositiveEach = Annotated[
+    tuple[Positive, ...],
+    BeforeValidator(_vector),
+    Field(min_length=1),
+    _number_or_list({"type": "number", "exclusiveMinimum": 0}),
+]
+NonNegativeEach = Annotated[
+    tuple[NonNegative, ...],
+    BeforeValidator(_vector),
+    Field(min_length=1),
+    _number_or_list({"type": "number", "minimum": 0}),
+]
+FiniteEach = Annotated[
+    tuple[Finite, ...],
+    BeforeValidator(_vector),
+    Field(min_length=1),
+    _number_or_list({"type": "number"}),
+]
+
+
+def expand(values: tuple[float, ...], size: int) -> np.ndarray:
+    """Widen one number to `size` entries; pass a full list through. Shape (size,)."""
+    return np.full(size, values[0]) if len(values) == 1 else np.array(values, dtype=float)
+
+
+class Strict(BaseModel):
+    """Base of all parts: unknown keys, coercions and non-finite numbers are refused."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+
+class Plant(Strict):
+    """The robot that MuJoCo steps."""
+
+    model: str = "two_link"
+    """MJCF: the name of a shipped model, or a path relative to the scenario file."""
+    links: Literal["point_mass", "rod"] = "point_mass"
+    """Mass of each link: a point at its tip, or a uniform thin rod."""
+    masses: Positives | None = (1.0, 2.3)
+    """Link masses (kg); null keeps what the MJCF says."""
+    lengths: Positives | None = (1.0, 1.0)
+    """Link lengths (m); null keeps what the MJCF says."""
+    gravity: NonNegative = 9.81
+    """Gravitational acceleration, along -z (m/s²)."""
+    integrator: Literal["rk4", "euler", "implicitfast"] = "rk4"
+    """MuJoCo's integrator."""
+
+    @model_validator(mode="after")
+    def _same_links(self) -> Plant:
+        if (self.masses is None) != (self.lengths is None):
+            raise PydanticCustomError(
+                "masses_and_lengths", "masses and lengths must both be given, or both be null"
+            )
+        if self.masses and self.lengths and len(self.masses) != len(self.lengths):
+            raise PydanticCustomError(
+                "masses_and_lengths",
+                "masses has {masses} entries and lengths has {lengths}; one of each a link",
+                {"masses": len(self.masses), "lengths": len(self.lengths)},
+            )
+        return self
+
+
+class Initial(Strict):
+    """Where the robot starts."""
+
+    q: Vector = (0.5, 0.5)
+    """Joint angles (rad)."""
+    qd: FiniteEach = (0.0,)
+    """Joint velocities (rad/s); one number stands for all joints."""
+
+
+class Sinusoid(Strict):
+    """q_ref,i(t) = offset_i + amplitude_i sin(frequency_i t + phase_i)."""
+
+    kind: Literal["sinusoid"]
+    amplitude: FiniteEach = (1.0,)
+    """Amplitude (rad)."""
+    frequency: FiniteEach = (0.5,)
+    """Angular frequency (rad/s)."""
+    phase: FiniteEach = (0.0,)
+    """Phase (rad); pi/2 makes a cosine."""
+    offset: FiniteEach = (0.0,)
+    """Centre of the oscillation (rad)."""
+
+
+class Setpoint(Strict):
+    """Rest at `start`, one quintic (minimum-jerk) blend, rest at `goal`."""
+
+    kind: Literal["setpoint"]
+    start: Vector
+    """Joint angles before the move (rad)."""
+    goal: Vector
+    """Joint angles after the move (rad)."""
+    start_time: NonNegative = 0.0
+    """When the move begins (s)."""
+    blend_time: Positive
+    """How long the move takes (s)."""
+
+
+class Waypoints(Strict):
+    """A quintic spline through timed points, at rest before the first and after the last."""
+
+    kind: Literal["waypoints"]
+    times: Annotated[tuple[NonNegative, ...], BeforeValidator(_tuple), Field(min_length=2)]
+    """When each point is passed (s), strictly increasing."""
+    points: Annotated[tuple[Vector, ...], BeforeValidator(_tuple), Field(min_length=2)]
+    """Joint angles at each time (rad)."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Waypoints:
+        if len(self.times) != len(self.points):
+            raise PydanticCustomError(
+                "waypoint_count",
+                "times has {times} entries and points has {points}; one time a point",
+                {"times": len(self.times), "points": len(self.points)},
+            )
+        if any(b <= a for a, b in zip(self.times, self.times[1:], strict=False)):
+            raise PydanticCustomError("waypoint_order", "times must be strictly increasing")
+        return self
+
+
+Reference = Annotated[Sinusoid | Setpoint | Waypoints, Field(discriminator="kind")]
+
+
+class Network(Strict):
+    """The deep network f̂ and its initial weights."""
+
+    hidden: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=4096)], ...],
+        BeforeValidator(_tuple),
+        Field(min_length=1, max_length=32),
+    ] = (64, 64, 64)
+    """Width of each hidden layer; three hidden layers make the paper's four weight layers."""
+    activation: Literal["sigmoid", "tanh", "relu"] = "sigmoid"
+    """Activation of the hidden layers; the output layer is linear."""
+    outputs: Literal["full", "kinematic"] = "full"
+    """full: all 2n rows are learned (paper). kinematic: the upper n rows are the measured q̇."""
+    bias: bool = True
+    """Whether each layer sees a constant 1 beside its inputs."""
+    init_scale: Positive | None = None
+    """Kumar's constant: spread = init_scale/√fan_in. null takes the activation's own (sigmoid 3.6)."""
+    init_spread: Literal["standard_deviation", "variance"] = "standard_deviation"
+    """Whether init_scale/√fan_in is a standard deviation or a variance; the paper does not say."""
+    output_scale: Positive = 1.0
+    """Factor on the initial weights of the output layer."""
+    backend: Literal["kernel", "torch"] = "kernel"
+    """kernel: compiled (fast). torch: the reference that the kernel is tested against (slow)."""
+
+
+class Madam(Strict):
+    """Multiplicative adaptive moments, Alg. 1 of the paper."""
+
+    eta: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.001
+    """Learning rate η."""
+    eta_max: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.1
+    """η*, the largest exponent of one update; the paper's 100 η."""
+    sigma_max: Positive = 1250.0
+    """σ*, the largest magnitude of a weight."""
+    beta: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.999
+    """β, the forgetting factor of the second moment."""
+    bias_correction: bool = False
+    """Divide the second moment by 1 - β^k, as Adam does; the paper's algorithm does not."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Madam:
+        if self.eta_max < self.eta:
+            raise PydanticCustomError(
+                "eta_order",
+                "eta_max = {eta_max} is below eta = {eta}; allowed: eta_max >= eta",
+                {"eta_max": self.eta_max, "eta": self.eta},
+            )
+        return self
+
+
+class Observer(Strict):
+    """The state observer of Eq. 5."""
+
+    K2: PositiveEach = (30.0,)
+    """Observer gain (1/s): one number, or one for each of the 2n states."""
+    feedback: Literal["stable", "as_printed"] = "stable"
+    """stable: +K₂(X - X̂). as_printed: the paper's sign, which diverges."""
+
+
+class Inertia(Strict):
+    """B₂ = M(q)⁻¹ of the controller's nominal model."""
+
+    kind: Literal["inertia"]
+    masses: Positives | None = None
+    """Masses that the controller believes (kg); null: the plant's."""
+    lengths: Positives | None = None
+    """Lengths that the controller believes (m); null: the plant's."""
+
+
+class Constant(Strict):
+    """B₂ = b·I: no model at all."""
+
+    kind: Literal["constant"]
+    b: Positive = 1.0
+    """Control effectiveness (1/(kg·m²))."""
+
+
+Effectiveness = Annotated[Inertia | Constant, Field(discriminator="kind")]
+
+
+class Inversion(Strict):
+    """Dynamic inversion with slack augmentation, Eq. 10 and after."""
+
+    K: PositiveEach = (7.5,)
+    """Tracking gain (1/s): one number, or one for each of the 2n states."""
+    lam: NonNegative = 7.5
+    """λ of the slack matrix B_s = [I; -λI] (1/s). The paper leaves B_s open."""
+    slack_matrix: Matrix | None = None
+    """A general slack matrix B_s, 2n rows of n; it replaces lam."""
+    effectiveness: Effectiveness = Field(default_factory=lambda: Inertia(kind="inertia"))
+    """What the controller takes for B."""
+
+    @model_validator(mode="after")
+    def _invertible(self) -> Inversion:
+        if self.slack_matrix is None:
+            return self
+        rows, widths = len(self.slack_matrix), {len(row) for row in self.slack_matrix}
+        if widths != {rows // 2} or rows % 2:
+            raise PydanticCustomError(
+                "slack_shape", "slack_matrix must have 2n rows of n numbers each"
+            )
+        upper = np.array(self.slack_matrix[: rows // 2])
+        if np.linalg.matrix_rank(upper) < rows // 2:
+            raise PydanticCustomError(
+                "slack_singular",
+                "the upper n rows of slack_matrix are singular, so [B B_s] has no inverse",
+            )
+        return self
+
+
+class DnnMso(Strict):
+    """The paper's controller: the network learns all the dynamics."""
+
+    kind: Literal["dnn_mso"]
+    inversion: Inversion = Inversion()
+    observer: Observer = Observer()
+    network: Network = Network()
+    madam: Madam = Madam()
+
+
+class NoNetwork(Strict):
+    """The paper's controller with the network off: inversion and feedback alone."""
+
+    kind: Literal["no_network"]
+    inversion: Inversion = Inversion()
+    observer: Observer = Observer()
+    kinematics: bool = True
+    """Whether q̇ stands in the upper rows of f̂; false leaves all of f̂ at zero."""
+
+
+class ClassicalMso(Strict):
+    """Eq. 4: known dynamics of the nominal model plus a learned uncertainty d̂."""
+
+    kind: Literal["classical_mso"]
+    inversion: Inversion = Inversion()
+    observer: Observer = Observer()
+    network: Network = Network()
+    madam: Madam = Madam()
+
+    @model_validator(mode="after")
+    def _needs_a_model(self) -> ClassicalMso:
+        if isinstance(self.inversion.effectiveness, Constant):
+            raise PydanticCustomError(
+                "needs_model",
+                "classical_mso knows its dynamics: inversion.effectiveness.kind must be inertia",
+            )
+        return self
+
+
+Controller = Annotated[DnnMso | NoNetwork | ClassicalMso, Field(discriminator="kind")]
+
+
+class Imperfections(Strict):
+    """What separates the simulation from a robot."""
+
+    torque_limit: PositiveEach | None = None
+    """Largest |torque| of each joint's actuator (N·m); null: none."""
+
+
+class Scenario(Strict):
+    """One experiment. Where the paper gives a number, it is the default."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+    """Short name; logs and figures are named after it."""
+    description: str = ""
+    """One or two sentences for people."""
+    duration: Positive = 10.0
+    """Simulated time (s); a whole number of steps."""
+    dt: Annotated[float, Field(ge=1e-5, le=0.1, allow_inf_nan=False)] = 0.001
+    """Control period and integration step (s)."""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Seed of the initial weights."""
+    plant: Plant = Plant()
+    initial: Initial = Initial()
+    reference: Reference
+    controller: Controller
+    imperfections: Imperfections = Imperfections()
+
+    @property
+    def n_joints(self) -> int:
+        """n, the number of joints: the length of initial.q."""
+        return len(self.initial.q)
+
+    @property
+    def n_ticks(self) -> int:
+        """N = duration/dt, the number of control periods."""
+        return round(self.duration / self.dt)
+
+    @model_validator(mode="after")
+    def _whole_steps(self) -> Scenario:
+        steps = self.duration / self.dt
+        if not 1 <= round(steps) <= MAX_TICKS or abs(steps - round(steps)) > 1e-6:
+            raise PydanticCustomError(
+                "whole_steps",
+                "duration = {duration} is {steps} steps of dt = {dt}; "
+                "allowed: a whole number from 1 to {most}",
+                {"duration": self.duration, "dt": self.dt, "steps": steps, "most": MAX_TICKS},
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _lengths(self) -> Scenario:
+        n = self.n_joints
+        for path, found, allowed in self._vector_lengths(n):
+            if found not in allowed:
+                raise PydanticCustomError(
+                    "vector_length",
+                    "{path} has {found} entries; allowed: {allowed}, since initial.q has {n} joints",
+                    {
+                        "path": path,
+                        "found": found,
+                        "allowed": " or ".join(map(str, sorted(allowed))),
+                        "n": n,
+                    },
+                )
+        return self
+
+    def _vector_lengths(self, n: int) -> list[tuple[str, int, set[int]]]:
+        """Every vector: its key path, its length and the lengths allowed."""
+        out: list[tuple[str, int, set[int]]] = [("initial.qd", len(self.initial.qd), {1, n})]
+        if self.plant.masses:
+            out.append(("plant.masses", len(self.plant.masses), {n}))
+        match self.reference:
+            case Sinusoid() as ref:
+                for name in ("amplitude", "frequency", "phase", "offset"):
+                    out.append((f"reference.{name}", len(getattr(ref, name)), {1, n}))
+            case Setpoint() as ref:
+                out.append(("reference.start", len(ref.start), {n}))
+                out.append(("reference.goal", len(ref.goal), {n}))
+            case Waypoints() as ref:
+                for k, point in enumerate(ref.points):
+                    out.append((f"reference.points.{k}", len(point), {n}))
+        inversion = self.controller.inversion
+        out.append(("controller.inversion.K", len(inversion.K), {1, 2 * n}))
+        if inversion.slack_matrix:
+            path = "controller.inversion.slack_matrix"
+            out.append((path, len(inversion.slack_matrix), {2 * n}))
+        if isinstance(inversion.effectiveness, Inertia):
+            for name in ("masses", "lengths"):
+                values = getattr(inversion.effectiveness, name)
+                if values:
+                    out.append((f"controller.inversion.effectiveness.{name}", len(values), {n}))
+        out.append(("controller.observer.K2", len(self.controller.observer.K2), {1, 2 * n}))
+        if self.imperfections.torque_limit:
+            path = "imperfections.torque_limit"
+            out.append((path, len(self.imperfections.torque_limit), {1, n}))
+        return out

@@ -1,0 +1,137 @@
+"""What a run is remembered by: one row of numbers a tick, and the columns made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dnnmso_mj.scenario import Scenario
+
+Array = np.ndarray
+
+FLAGS = ("saturated", "clipped", "deadline_missed")
+SCALARS = ("t", "drt_bound", "lyapunov", "ultimate_bound", "ultimate_bound_paper", "compute_us")
+
+
+@dataclass(frozen=True)
+class StepLayout:
+    """Names, order and widths of the columns of one tick.
+
+    Args:
+        n_joints: n, the number of joints.
+        n_layers: number of weight layers of the controller's network; 0 without a network.
+    """
+
+    n_joints: int
+    n_layers: int
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Field name -> number of doubles, in the order of the log's protobuf fields."""
+        n, layers = self.n_joints, self.n_layers
+        return {
+            "t": 1,  # s
+            "q": n,  # rad, true state at t_k
+            "qd": n,  # rad/s
+            "q_meas": n,  # rad, what the sensors said
+            "qd_meas": n,  # rad/s
+            "q_ref": n,  # rad
+            "qd_ref": n,  # rad/s
+            "tau_cmd": n,  # N·m, what the controller asked for
+            "tau": n,  # N·m, applied from t_k to t_k+1
+            "x_hat": 2 * n,  # observer state
+            "f_hat": 2 * n,  # learned dynamics
+            "f_true": 2 * n,  # Ẋ − B τ, the dynamics the network should learn
+            "e_obs": 2 * n,  # e_a = X − X̂
+            "weight_norm": layers,  # ‖W_l‖_F
+            "update_ratio": layers,  # ‖ΔW_l‖_F / ‖W_l‖_F of this tick
+            "eta_bound": layers,  # Theorem 1: descent is guaranteed for η below it
+            "gradient_change": layers,  # ‖g_l(W+ΔW) − g_l(W)‖ / ‖g_l(W)‖, sampled and held
+            "drt_bound": 1,  # deep relative trust: what bounds gradient_change
+            "lyapunov": 1,  # L = e_rᵀ e_r
+            "ultimate_bound": 1,  # rad, on each |e_i|, for the loop that is really closed
+            "ultimate_bound_paper": 1,  # on ‖e_r‖, as the paper states it
+            "compute_us": 1,  # µs, wall time of the controller's update
+            "saturated": 1,  # flags, 0 or 1
+            "clipped": 1,
+            "deadline_missed": 1,
+        }
+
+    @property
+    def width(self) -> int:
+        """Number of doubles in one row."""
+        return sum(self.widths.values())
+
+    @property
+    def slices(self) -> dict[str, slice]:
+        """Field name -> where it stands in the row."""
+        out, start = {}, 0
+        for name, width in self.widths.items():
+            out[name] = slice(start, start + width)
+            start += width
+        return out
+
+    def columns(self, rows: Array) -> dict[str, Array]:
+        """Split rows (N, width) into columns: vectors (N, k), scalars (N,), flags (N,) of bool."""
+        out: dict[str, Array] = {}
+        for name, where in self.slices.items():
+            column = rows[:, where]
+            if name in SCALARS:
+                column = column[:, 0]
+            elif name in FLAGS:
+                column = column[:, 0] != 0.0
+            out[name] = column
+        return out
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something worth a line in the log: a divergence, a first saturation, the end of a run."""
+
+    t: float  # s
+    level: str  # "info" | "warning" | "error"
+    message: str
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """What is known of a run beside its columns."""
+
+    status: str  # "ok" | "diverged" | "interrupted" | "unfinished" (torn log)
+    seed: int
+    wall_s: float = 0.0
+    reason: str = ""  # why a run diverged
+    versions: Mapping[str, str] = field(default_factory=dict)
+    git_commit: str = ""
+    metrics: Mapping[str, float | int | bool | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Trace:
+    """The columns of a run, e.g. ``trace["q"]`` of shape (N, n), with the scenario it came from."""
+
+    columns: Mapping[str, Array]
+    scenario: Scenario
+    info: RunInfo
+    events: tuple[Event, ...] = ()
+
+    def __getitem__(self, name: str) -> Array:
+        return self.columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.columns)
+
+    def __len__(self) -> int:
+        return len(self.columns["t"])
+
+    @property
+    def n_joints(self) -> int:
+        """n, the number of joints."""
+        return int(self.columns["q"].shape[1])
+
+    @property
+    def n_layers(self) -> int:
+        """Number of weight layers of the controller's network; 0 without one."""
+        return int(self.columns["weight_norm"].shape[1])
