@@ -23,6 +23,7 @@ import numpy as np
 
 Array = np.ndarray
 Links = Literal["point_mass", "rod"]
+LINKS: tuple[Links, ...] = ("point_mass", "rod")
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,10 @@ class TwoLink:
     def _lumped(self) -> tuple[float, float, float, float, float]:
         """α, β, h and the two gravity moments per unit g."""
         (m1, m2), (l1, l2) = self.masses, self.lengths
-        (c1, i1), (c2, i2) = (centre_and_inertia(self.links, m1, l1),
-                              centre_and_inertia(self.links, m2, l2))
+        (c1, i1), (c2, i2) = (
+            centre_and_inertia(self.links, m1, l1),
+            centre_and_inertia(self.links, m2, l2),
+        )
         alpha = m1 * c1**2 + i1 + m2 * l1**2
         beta = m2 * c2**2 + i2
         return alpha, beta, m2 * l1 * c2, m1 * c1 + m2 * l1, m2 * c2

@@ -84,7 +84,7 @@ def set_links(
         body.mass = mass
         body.ipos = [centre, 0.0, 0.0]
         # A thin rod along x: no inertia about its own axis.
-        body.inertia = [POINT_INERTIA, inertia + POINT_INERTIA, inertia + POINT_INERTIA]
+        body.inertia = [POINT_INERTIA, max(inertia, POINT_INERTIA), max(inertia, POINT_INERTIA)]
         body.explicitinertial = 1
         for child in body.bodies:
             child.pos = [length, 0.0, 0.0]

@@ -85,7 +85,7 @@ class TrackingBounds:
         n = n_joints
         K, coupling = expand(spec.K, 2 * n), slack_coupling(slack_matrix(spec, n))
         self._K, self._lam = float(K[0]), float(coupling[0, 0])
-        self._scalar = bool(np.all(K == K[0]) and np.array_equal(coupling, self._lam * np.eye(n)))
+        self._scalar = bool(np.ptp(K) == 0 and np.array_equal(coupling, self._lam * np.eye(n)))
         self._n = n
         self._s_decay, self._s_gain = _hold(self._K, dt)
         self._e_decay, self._e_gain = _hold(self._lam, dt)
