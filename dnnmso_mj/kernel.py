@@ -25,12 +25,12 @@ ACTIVATIONS: dict[Activation, int] = {"sigmoid": 0, "tanh": 1, "relu": 2}
 W_SQ, G_SQ, GW, DW_SQ, CLIPPED = range(5)
 
 # Reassociation lets sums vectorise; NaN and infinity keep their meaning, for they must be caught.
-_COMPILE = {
-    "cache": True,
-    "nogil": True,
-    "error_model": "numpy",
-    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
-}
+compiled = njit(
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+    fastmath={"reassoc", "contract", "arcp", "nsz"},
+)
 
 
 def activations_size(sizes: tuple[int, ...]) -> int:
@@ -38,7 +38,7 @@ def activations_size(sizes: tuple[int, ...]) -> int:
     return sum(sizes) + len(sizes)
 
 
-@njit(**_COMPILE)  # type: ignore[untyped-decorator]
+@compiled
 def forward(w: Array, sizes: Array, bias: bool, activation: int, x: Array, acts: Array) -> int:
     """Run the network on x (n_in,). Returns where its output begins in `acts`."""
     n_layers = sizes.size - 1
@@ -69,7 +69,7 @@ def forward(w: Array, sizes: Array, bias: bool, activation: int, x: Array, acts:
     return a
 
 
-@njit(**_COMPILE)  # type: ignore[untyped-decorator]
+@compiled
 def _slope(activation: int, a: float) -> float:
     """σ'(z) from a = σ(z)."""
     if activation == 0:
@@ -79,7 +79,7 @@ def _slope(activation: int, a: float) -> float:
     return 1.0 if a > 0.0 else 0.0
 
 
-@njit(**_COMPILE)  # type: ignore[untyped-decorator]
+@compiled
 def _exp(x: float) -> float:
     """exp(x) for |x| ≤ 1 to 1e-14, without a call, so that the loop around it vectorises."""
     y = x * 0.125
@@ -97,7 +97,7 @@ def _exp(x: float) -> float:
     return p * p
 
 
-@njit(**_COMPILE)  # type: ignore[untyped-decorator]
+@compiled
 def _madam_row(
     w: Array, v: Array, inputs: Array, back: Array, delta: float, madam: Array, sums: Array
 ) -> None:
@@ -131,7 +131,7 @@ def _madam_row(
     sums[4] += clipped
 
 
-@njit(**_COMPILE)  # type: ignore[untyped-decorator]
+@compiled
 def learn(
     w: Array,
     v: Array,
@@ -181,7 +181,7 @@ def learn(
         out = a
 
 
-@njit(**_COMPILE)  # type: ignore[untyped-decorator]
+@compiled
 def gradient(
     w: Array,
     sizes: Array,

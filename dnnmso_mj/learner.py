@@ -40,7 +40,8 @@ class Monitors:
     @classmethod
     def zeros(cls, n_layers: int) -> Monitors:
         """Monitors before the first update."""
-        return cls(*(np.zeros(n_layers) for _ in range(4)))
+        norm, ratio, bound, change = np.zeros((4, n_layers))
+        return cls(norm, ratio, bound, change)
 
 
 class Learner(Protocol):
@@ -93,9 +94,7 @@ class KernelLearner:
         out = self._acts.size - shape.sizes[-1] - 1
         self._output, self._delta = self._acts[out:-1], self._deltas[out:-1]
         self._stats = np.zeros((shape.n_layers, 5))
-        self._madam = np.array(
-            [spec.eta, spec.eta_max / spec.eta, spec.sigma_max, spec.beta, 1.0]
-        )
+        self._madam = np.array([spec.eta, spec.eta_max / spec.eta, spec.sigma_max, spec.beta, 1.0])
         self._x = np.zeros(shape.sizes[0])
         self._before, self._after = np.zeros_like(weights), np.zeros_like(weights)
 
@@ -190,7 +189,9 @@ class TorchLearner:
 
     def _backward(self, delta: Array) -> Array:
         self.optimizer.zero_grad()
-        self._output.backward(self._torch.tensor(delta, dtype=self._torch.float64))
+        self._torch.autograd.backward(
+            self._output, self._torch.tensor(delta, dtype=self._torch.float64)
+        )
         return self.network.flat_gradient()
 
     def _sums(self, w: Array, g: Array) -> Array:

@@ -26,7 +26,7 @@ from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
 Array = np.ndarray
 Progress = Callable[[int], None]
 
-# rad, rad/s: no arm is there and comes back. Divergence is called before numbers overflow.
+# rad, rad/s: no arm is there and comes back.
 DIVERGED_ABOVE = 1e3
 BLOCK = 1024  # ticks between two looks at the reference, progress and interrupts
 SNAPSHOT_PERIOD = 1.0  # s
@@ -151,8 +151,9 @@ class Simulation:
             raise NonFiniteError("tau", command.tau.tolist())
         self._true_dynamics(command, tau)
         self._fill(command, tau)
-        self._check(row)
+        self._check_finite(row)
         recorder.append(row.data)
+        self._check_range(row)
         self._watch_saturation(t, recorder)
         self._bounds.begin(self._f_err)
         self._tau[:] = tau
@@ -187,11 +188,13 @@ class Simulation:
         row["saturated"][0] = self.actuators.saturated
         row["clipped"][0] = monitors.clipped
 
-    def _check(self, row: Row) -> None:
-        """Stop at the first row that is not finite, or where the state has left this world."""
+    def _check_finite(self, row: Row) -> None:
         if not np.isfinite(row.data).all():
             name = next(f for f in self.layout.widths if not np.isfinite(row[f]).all())
             raise NonFiniteError(name, row[name].tolist())
+
+    def _check_range(self, row: Row) -> None:
+        """Stop where the state has left this world, long before numbers overflow."""
         for name in ("q", "qd", "x_hat"):
             largest = float(np.abs(row[name]).max())
             if largest > DIVERGED_ABOVE:

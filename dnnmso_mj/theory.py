@@ -21,10 +21,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from dnnmso_mj.inversion import slack_coupling, slack_matrix
-from dnnmso_mj.kernel import CLIPPED, DW_SQ, G_SQ, GW, W_SQ
+from dnnmso_mj.kernel import CLIPPED, DW_SQ, G_SQ, GW, W_SQ, compiled
 from dnnmso_mj.scenario import Inversion as InversionSpec
 from dnnmso_mj.scenario import expand
 
@@ -33,7 +32,7 @@ Array = np.ndarray
 UNDEFINED = -1.0  # logged where a bound does not exist for the gains in use
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def layer_monitors(
     stats: Array, weight_norm: Array, update_ratio: Array, eta_bound: Array
 ) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,14 @@ from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
 
 ROOT = Path(__file__).parents[1]
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    """Where DNNMSO_NO_SKIPS is set, a skipped test fails the run: nothing may be missing there."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if os.environ.get("DNNMSO_NO_SKIPS") and reporter.stats.get("skipped") and exitstatus == 0:
+        reporter.write_line("skipped tests are not allowed with DNNMSO_NO_SKIPS", red=True)
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 @pytest.fixture(scope="session")

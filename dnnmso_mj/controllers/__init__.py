@@ -45,7 +45,7 @@ class Controller(Protocol):
         """Start from the measured state x = [q; q̇] (2n,)."""
 
     def update(self, x: Array, x_ref: Array, xd_ref: Array) -> Command:
-        """Command the torque for measured x (2n,) and the reference x_ref, its derivative xd_ref."""
+        """Command the torque for measured x, reference x_ref and its derivative, each (2n,)."""
 
     def effect(self, tau: Array) -> Array:
         """B τ (2n,) of a torque other than the commanded one, at the state of the last update."""

@@ -1,0 +1,66 @@
+# Two commands do all the set-up: `make run` and `make test`. `make help` lists the rest.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
+SCENARIO ?= scenarios/paper.yaml
+PYTEST_ARGS ?=
+
+.PHONY: help run test check format figures schema build clean
+
+help:
+	@echo "make run      install, run $(SCENARIO), print where the log and the figures are"
+	@echo "make test     install what the tests need and run them all"
+	@echo "make check    format, lint and type checks"
+	@echo "make format   format and fix what can be fixed"
+	@echo "make figures  draw the pictures of the README and docs anew"
+	@echo "make schema   write scenarios/scenario.schema.json anew"
+	@echo "make build    build wheel and sdist into dist/"
+	@echo "make clean    remove the environment and all caches"
+
+run: $(VENV)/.installed-run
+	$(BIN)/dnnmso run $(SCENARIO)
+
+test: $(VENV)/.installed-test
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+check: $(VENV)/.installed-check
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+format: $(VENV)/.installed-check
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+figures: $(VENV)/.installed-test
+	$(BIN)/python docs/make_figures.py
+
+schema: $(VENV)/.installed-run
+	$(BIN)/dnnmso schema > $(VENV)/schema.json
+	mv $(VENV)/schema.json scenarios/scenario.schema.json
+
+build: $(VENV)/.installed-test
+	$(BIN)/python -m build --no-isolation
+
+clean:
+	rm -rf $(VENV) dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(VENV)/bin/pip:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "dnnmso_mj needs Python 3.11 or newer; try: make PYTHON=python3.12" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed-run: pyproject.toml constraints.txt | $(VENV)/bin/pip
+	$(PIP) --editable ".[viewer]"
+	@touch $@
+
+$(VENV)/.installed-test: pyproject.toml constraints.txt | $(VENV)/bin/pip
+	$(PIP) --editable ".[test]"
+	@touch $@ $(VENV)/.installed-run
+
+$(VENV)/.installed-check: pyproject.toml constraints.txt | $(VENV)/bin/pip
+	$(PIP) --editable ".[check]"
+	@touch $@ $(VENV)/.installed-run $(VENV)/.installed-test
