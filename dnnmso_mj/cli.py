@@ -292,10 +292,10 @@ def _print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
     console.print(table)
     simulated = len(trace) * trace.scenario.dt
     print(f"{simulated:g} s simulated in {info.wall_s:.2f} s")
-    print(f"log      {log}")
+    print(f"log      {_near(log)}")
     for figure in figures:
-        print(f"figure   {figure}")
-    print(f"replay   dnnmso replay {log}")
+        print(f"figure   {_near(figure)}")
+    print(f"replay   dnnmso replay {_near(log)}")
 
 
 UNITS = {
@@ -311,6 +311,12 @@ UNITS = {
     "compute_us_p999": "µs",
     "deadline_misses": "ticks",
 }
+
+
+def _near(path: Path) -> Path:
+    """The path as a person here would type it."""
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
 
 
 def _number(value: Any) -> str:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from dnnmso_mj.errors import LogError
 from dnnmso_mj.metrics import compute_metrics
@@ -54,16 +57,19 @@ def run_logged(
     with _open_log(simulation, mjcf, out, force) as recorder:
         info = simulation.run(recorder, progress)
         recorder.flush()
-        trace = read_trace(recorder.path)
-        trace = replace(trace, info=replace(trace.info, **vars(info) | _written(trace)))
+        if recorder.ticks:
+            trace = read_trace(recorder.path)
+        else:  # diverged before its first row
+            empty = np.empty((0, simulation.layout.width))
+            trace = Trace(simulation.layout.columns(empty), scenario, info)
+        written: dict[str, Any] = {
+            "versions": trace.info.versions,
+            "git_commit": trace.info.git_commit,
+        }
+        trace = replace(trace, info=replace(info, **written))
         info = replace(trace.info, metrics=compute_metrics(trace))
         recorder.finish(info)
     return LoggedRun(replace(trace, info=info), recorder.path)
-
-
-def _written(trace: Trace) -> dict[str, object]:
-    """What the log knows of a run and the simulation does not."""
-    return {"versions": trace.info.versions, "git_commit": trace.info.git_commit}
 
 
 def _open_log(simulation: Simulation, mjcf: Mjcf, out: Path | None, force: bool) -> McapRecorder:

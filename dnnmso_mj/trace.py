@@ -99,7 +99,7 @@ class Event:
 class RunInfo:
     """What is known of a run beside its columns."""
 
-    status: str  # "ok" | "diverged" | "interrupted" | "unfinished" (torn log)
+    status: str  # "ok" | "diverged" | "interrupted" | "failed" | "unfinished" (torn log)
     seed: int
     wall_s: float = 0.0
     reason: str = ""  # why a run diverged

@@ -1,0 +1,239 @@
+"""What stands where in a log file: the names and formats that its writer and its readers share."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from google.protobuf.descriptor import FileDescriptor
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.message import DecodeError
+from google.protobuf.timestamp_pb2 import Timestamp
+from mcap.writer import CompressionType, Writer
+
+from dnnmso_mj import step_message
+from dnnmso_mj.errors import LogError
+from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.trace import Event, RunInfo
+
+Array = np.ndarray
+
+NS_PER_S = 1_000_000_000
+MODEL = "model.xml"  # the attachment that holds the MJCF
+_CHUNK_BYTES = 64 * 1024
+_SNAPSHOT, _NPZ = "snapshot/", ".npz"
+_LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
+_LEVEL_NAMES = {number: name for name, number in _LEVELS.items()}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A channel of the log and the schema of its messages."""
+
+    name: str
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+    encoding: str
+
+
+def protobuf_topic(name: str, file: FileDescriptor, schema_name: str) -> Topic:
+    """A topic of a compiled protobuf schema, together with all the schema imports."""
+    files: dict[str, FileDescriptor] = {}
+
+    def collect(part: FileDescriptor) -> None:
+        for dependency in part.dependencies:
+            collect(dependency)
+        files.setdefault(part.name, part)
+
+    collect(file)
+    schema = FileDescriptorSet()
+    for part in files.values():
+        part.CopyToProto(schema.file.add())
+    return Topic(name, schema_name, "protobuf", schema.SerializeToString(), "protobuf")
+
+
+STEP = Topic(
+    name="/step",
+    schema_name=step_message.SCHEMA_NAME,
+    schema_encoding="protobuf",
+    schema=step_message.schema().SerializeToString(),
+    encoding="protobuf",
+)
+EVENTS = protobuf_topic("/events", Log.DESCRIPTOR.file, "foxglove.Log")
+
+
+def create(path: Path, force: bool = False) -> BinaryIO:
+    """Open a new file, in a folder that is made when missing.
+
+    Raises:
+        LogError: the file exists and `force` does not say to remove it, or cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if force:
+            path.unlink(missing_ok=True)
+        return _open_new(path)
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def _open_new(path: Path) -> BinaryIO:
+    try:
+        return path.open("xb")
+    except FileExistsError as error:
+        raise LogError(f"{path} exists already. Choose another name, or remove it.") from error
+
+
+def unwritable(path: Path, error: OSError) -> LogError:
+    """The error to raise when the operating system does not let a file be written."""
+    return LogError(
+        f"{path} cannot be written: {error.strerror or error}. Choose another place for it."
+    )
+
+
+def new_writer(file: BinaryIO) -> Writer:
+    """Start an MCAP file whose chunks are small enough to be compressed within a control period."""
+    writer = Writer(
+        file, chunk_size=_CHUNK_BYTES, compression=CompressionType.LZ4, enable_data_crcs=True
+    )
+    writer.start(library=f"dnnmso_mj {version('dnnmso_mj')}")
+    return writer
+
+
+def timestamp(time_ns: int) -> Timestamp:
+    """Simulation time (ns) as protobuf has it."""
+    return Timestamp(seconds=time_ns // NS_PER_S, nanos=time_ns % NS_PER_S)
+
+
+def event_message(event: Event) -> bytes:
+    """An event as foxglove.Log."""
+    message = Log(
+        timestamp=timestamp(round(event.t * NS_PER_S)),
+        level=_LEVELS[event.level],
+        message=event.message,
+        name="dnnmso",
+    )
+    return message.SerializeToString()
+
+
+def event_of(data: bytes) -> Event:
+    """The event in a foxglove.Log.
+
+    Raises:
+        ValueError: the bytes are no foxglove.Log.
+    """
+    try:
+        message = Log.FromString(data)
+    except DecodeError as error:
+        raise ValueError(f"a message on {EVENTS.name} is no {EVENTS.schema_name}") from error
+    t = (message.timestamp.seconds * NS_PER_S + message.timestamp.nanos) / NS_PER_S
+    return Event(t, _LEVEL_NAMES.get(message.level, "info"), message.message)
+
+
+def scenario_record(scenario: Scenario) -> dict[str, str]:
+    """The metadata record "scenario", which opens a log."""
+    return {
+        "name": scenario.name,
+        "seed": str(scenario.seed),
+        "json": scenario.model_dump_json(),
+    }
+
+
+def run_record(info: RunInfo) -> dict[str, str]:
+    """The metadata record "run", which ends a log."""
+    return {
+        "status": info.status,
+        "reason": info.reason,
+        "seed": str(info.seed),
+        "wall_s": repr(float(info.wall_s)),
+    }
+
+
+def metrics_record(metrics: Mapping[str, float | int | bool | None]) -> dict[str, str]:
+    """The metadata record "metrics": a JSON value under each name.
+
+    Raises:
+        LogError: a metric is not finite.
+    """
+    for name, value in metrics.items():
+        if value is not None and not np.isfinite(value):
+            raise LogError(
+                f"metric {name} = {value}; allowed: a finite number, true, false or null. "
+                "Record a metric that this run does not define as null."
+            )
+    return {name: json.dumps(value) for name, value in metrics.items()}
+
+
+def run_info(records: Mapping[str, Mapping[str, str]]) -> RunInfo:
+    """What the metadata records of a log say about its run.
+
+    Raises:
+        ValueError: a value is not of its type.
+    """
+    run = {"status": "unfinished", **records.get("scenario", {}), **records.get("run", {})}
+    return RunInfo(
+        status=run["status"],
+        seed=int(run.get("seed", "0")),
+        wall_s=float(run.get("wall_s", "0")),
+        reason=run.get("reason", ""),
+        versions=dict(records.get("versions", {})),
+        git_commit=records.get("git", {}).get("commit", ""),
+        metrics={name: json.loads(value) for name, value in records.get("metrics", {}).items()},
+    )
+
+
+def snapshot_name(name: str, t: float) -> str:
+    """The name of a snapshot's attachment; it has all digits of t, so that t reads back exactly."""
+    return f"{_SNAPSHOT}{name}/{float(t)!r}{_NPZ}"
+
+
+def snapshot_place(attachment: str) -> tuple[str, float] | None:
+    """Name and time (s) of a snapshot from its attachment's name; None when it is no snapshot."""
+    name, _, t = attachment.removeprefix(_SNAPSHOT).removesuffix(_NPZ).rpartition("/")
+    try:
+        place = name, float(t)
+    except ValueError:
+        return None
+    return place if attachment == snapshot_name(*place) else None
+
+
+def snapshot_data(name: str, arrays: Mapping[str, Array]) -> bytes:
+    """Arrays as NumPy's npz, without pickle.
+
+    Raises:
+        LogError: an array holds Python objects.
+    """
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        for key, value in arrays.items():
+            array = np.asarray(value)
+            if array.dtype.hasobject:
+                raise LogError(
+                    f"snapshot {name!r}: array {key!r} has dtype {array.dtype}; "
+                    "allowed: numbers, booleans and strings. Convert it to one of these."
+                )
+            with archive.open(f"{key}.npy", "w") as file:
+                np.lib.format.write_array(file, array, allow_pickle=False)
+    return data.getvalue()
+
+
+def snapshot_arrays(data: bytes) -> dict[str, Array]:
+    """Arrays from NumPy's npz, without pickle.
+
+    Raises:
+        ValueError: the bytes are no such file.
+    """
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except Exception as error:  # of many kinds: whatever damaged bytes provoke
+        raise ValueError("no npz file of plain arrays") from error

@@ -1,0 +1,88 @@
+"""Logs for the tests, and a child process that writes one until it is stopped.
+
+As a program: log_samples.py LOG COUNTER appends ticks for ever; COUNTER, mapped into memory, says
+at every moment how many.
+"""
+
+from __future__ import annotations
+
+import itertools
+import mmap
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dnnmso_mj.recording import McapRecorder
+from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.scene import Scene
+from dnnmso_mj.trace import FLAGS, Event, RunInfo, StepLayout
+
+MJCF = (Path(__file__).parents[1] / "models" / "two_link.xml").read_text()
+LAYOUT = StepLayout(n_joints=2, n_layers=4)
+OK = RunInfo(status="ok", seed=7)
+METRICS = {"rmse": 1.25e-4, "bound_violations": 3, "diverged": False, "settling_time": None}
+
+
+def scenario(**parts: Any) -> Scenario:
+    reference, controller = {"kind": "sinusoid"}, {"kind": "dnn_mso"}
+    return Scenario.model_validate(
+        {"name": "sample", "reference": reference, "controller": controller, "seed": 7, **parts}
+    )
+
+
+def scene() -> Scene:
+    return Scene(mujoco.MjModel.from_xml_string(MJCF))
+
+
+def rows(count: int, layout: StepLayout = LAYOUT, dt: float = 1e-3) -> np.ndarray:
+    """Random rows, with a true clock and flags of 0 and 1. More rows begin like fewer."""
+    rng = np.random.default_rng(5)
+    out = rng.normal(size=(count, layout.width))
+    out[:, layout.slices["t"]] = (np.arange(count) * dt)[:, None]
+    for name in FLAGS:
+        out[:, layout.slices[name]] = out[:, layout.slices[name]] > 0.0
+    return out
+
+
+def recorder(path: Path, layout: StepLayout = LAYOUT, **parts: Any) -> McapRecorder:
+    return McapRecorder(path, layout, scenario(**parts), scene(), MJCF)
+
+
+def append_all(path: Path, data: np.ndarray, info: RunInfo = OK) -> None:
+    """A finished log of these rows and nothing else."""
+    with recorder(path) as log:
+        for row in data:
+            log.append(row)
+        log.finish(info)
+
+
+def write_log(
+    path: Path, count: int = 230, layout: StepLayout = LAYOUT, **parts: Any
+) -> np.ndarray:
+    """A finished log with events, a snapshot and metrics; returns its rows."""
+    data = rows(count, layout)
+    with recorder(path, layout, **parts) as log:
+        log.snapshot("controller", 0.0, {"W": np.arange(6.0).reshape(2, 3)})
+        for row in data:
+            log.append(row)
+        log.event(Event(0.1, "warning", "torque limit reached"))
+        log.snapshot("controller", 0.2, {"W": np.full(3, 0.1), "n": np.array(4)})
+        log.finish(RunInfo(status="ok", seed=7, wall_s=0.25, metrics=METRICS))
+    return data
+
+
+def append_for_ever(path: Path, counter: Path) -> None:
+    data = rows(1000)
+    with counter.open("r+b") as file, mmap.mmap(file.fileno(), 8) as shared, recorder(path) as log:
+        for done in itertools.count(1):
+            log.append(data[(done - 1) % len(data)])
+            shared[:] = done.to_bytes(8, sys.byteorder)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+    append_for_ever(Path(sys.argv[1]), Path(sys.argv[2]))
