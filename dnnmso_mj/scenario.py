@@ -20,6 +20,13 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 MAX_TICKS = 100_000_000
+MAX_WEIGHTS = 10_000_000
+
+
+def _refusal(*problems: tuple[str, str]) -> PydanticCustomError:
+    """An error about several values: (key path below this part, what is wrong with it)."""
+    text = "; ".join(f"{path} {problem}" for path, problem in problems)
+    return PydanticCustomError("refused", "{text}", {"text": text, "problems": problems})
 
 
 def _tuple(value: Any) -> Any:
@@ -31,6 +38,10 @@ def _vector(value: Any) -> Any:
     return (value,) if is_number else _tuple(value)
 
 
+def _entries(count: int) -> str:
+    return "1 entry" if count == 1 else f"{count} entries"
+
+
 def _number_or_list(item: dict[str, Any]) -> WithJsonSchema:
     return WithJsonSchema({"anyOf": [item, {"type": "array", "items": item, "minItems": 1}]})
 
@@ -38,26 +49,27 @@ def _number_or_list(item: dict[str, Any]) -> WithJsonSchema:
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Vector = Annotated[tuple[Finite, ...], BeforeValidator(_tuple), Field(min_length=1)]
-Positives = Annotated[tuple[Positive, ...], BeforeValidator(_tuple), Field(min_length=1)]
-Matrix = Annotated[tuple[Vector, ...], BeforeValidator(_tuple), Field(min_length=1)]
+# The length stands before the conversion, or the JSON Schema would say minLength for minItems.
+Vector = Annotated[tuple[Finite, ...], Field(min_length=1), BeforeValidator(_tuple)]
+Positives = Annotated[tuple[Positive, ...], Field(min_length=1), BeforeValidator(_tuple)]
+Matrix = Annotated[tuple[Vector, ...], Field(min_length=1), BeforeValidator(_tuple)]
 # One number for all entries, or one for each; kept as a tuple and widened by `expand`.
 PositiveEach = Annotated[
     tuple[Positive, ...],
-    BeforeValidator(_vector),
     Field(min_length=1),
+    BeforeValidator(_vector),
     _number_or_list({"type": "number", "exclusiveMinimum": 0}),
 ]
 NonNegativeEach = Annotated[
     tuple[NonNegative, ...],
-    BeforeValidator(_vector),
     Field(min_length=1),
+    BeforeValidator(_vector),
     _number_or_list({"type": "number", "minimum": 0}),
 ]
 FiniteEach = Annotated[
     tuple[Finite, ...],
-    BeforeValidator(_vector),
     Field(min_length=1),
+    BeforeValidator(_vector),
     _number_or_list({"type": "number"}),
 ]
 
@@ -94,15 +106,11 @@ class Plant(Strict):
     @model_validator(mode="after")
     def _same_links(self) -> Plant:
         if (self.masses is None) != (self.lengths is None):
-            raise PydanticCustomError(
-                "masses_and_lengths", "masses and lengths must both be given, or both be null"
-            )
+            given = "masses" if self.lengths is None else "lengths"
+            raise _refusal((given, "stands alone; allowed: masses and lengths both, or both null"))
         if self.masses and self.lengths and len(self.masses) != len(self.lengths):
-            raise PydanticCustomError(
-                "masses_and_lengths",
-                "masses has {masses} entries and lengths has {lengths}; one of each a link",
-                {"masses": len(self.masses), "lengths": len(self.lengths)},
-            )
+            found, allowed = _entries(len(self.lengths)), len(self.masses)
+            raise _refusal(("lengths", f"has {found}; allowed: {allowed}, as many as masses"))
         return self
 
 
@@ -119,6 +127,7 @@ class Sinusoid(Strict):
     """q_ref,i(t) = offset_i + amplitude_i sin(frequency_i t + phase_i)."""
 
     kind: Literal["sinusoid"]
+    """A sine at each joint; a cosine by its phase."""
     amplitude: FiniteEach = (1.0,)
     """Amplitude (rad)."""
     frequency: FiniteEach = (0.5,)
@@ -133,6 +142,7 @@ class Setpoint(Strict):
     """Rest at `start`, one quintic (minimum-jerk) blend, rest at `goal`."""
 
     kind: Literal["setpoint"]
+    """One move from rest to rest."""
     start: Vector
     """Joint angles before the move (rad)."""
     goal: Vector
@@ -147,21 +157,21 @@ class Waypoints(Strict):
     """A quintic spline through timed points, at rest before the first and after the last."""
 
     kind: Literal["waypoints"]
-    times: Annotated[tuple[NonNegative, ...], BeforeValidator(_tuple), Field(min_length=2)]
+    """A smooth path through timed points."""
+    times: Annotated[tuple[NonNegative, ...], Field(min_length=2), BeforeValidator(_tuple)]
     """When each point is passed (s), strictly increasing."""
-    points: Annotated[tuple[Vector, ...], BeforeValidator(_tuple), Field(min_length=2)]
+    points: Annotated[tuple[Vector, ...], Field(min_length=2), BeforeValidator(_tuple)]
     """Joint angles at each time (rad)."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Waypoints:
         if len(self.times) != len(self.points):
-            raise PydanticCustomError(
-                "waypoint_count",
-                "times has {times} entries and points has {points}; one time a point",
-                {"times": len(self.times), "points": len(self.points)},
-            )
-        if any(b <= a for a, b in zip(self.times, self.times[1:], strict=False)):
-            raise PydanticCustomError("waypoint_order", "times must be strictly increasing")
+            found, allowed = _entries(len(self.times)), len(self.points)
+            raise _refusal(("times", f"has {found}; allowed: {allowed}, one for each of points"))
+        late = [k for k in range(1, len(self.times)) if self.times[k] <= self.times[k - 1]]
+        if late:
+            wrong = "is not after {}; allowed: strictly increasing times"
+            raise _refusal(*((f"times.{k}", wrong.format(self.times[k - 1])) for k in late))
         return self
 
 
@@ -173,8 +183,8 @@ class Network(Strict):
 
     hidden: Annotated[
         tuple[Annotated[int, Field(ge=1, le=4096)], ...],
-        BeforeValidator(_tuple),
         Field(min_length=1, max_length=32),
+        BeforeValidator(_tuple),
     ] = (64, 64, 64)
     """Width of each hidden layer; three hidden layers make the paper's four weight layers."""
     activation: Literal["sigmoid", "tanh", "relu"] = "sigmoid"
@@ -184,13 +194,21 @@ class Network(Strict):
     bias: bool = True
     """Whether each layer sees a constant 1 beside its inputs."""
     init_scale: Positive | None = None
-    """Kumar's constant: spread = init_scale/√fan_in. null takes the activation's own (sigmoid 3.6)."""
+    """Kumar's constant: spread = init_scale/√fan_in. null: the activation's own (sigmoid 3.6)."""
     init_spread: Literal["standard_deviation", "variance"] = "standard_deviation"
     """Whether init_scale/√fan_in is a standard deviation or a variance; the paper does not say."""
     output_scale: Positive = 1.0
     """Factor on the initial weights of the output layer."""
     backend: Literal["kernel", "torch"] = "kernel"
     """kernel: compiled (fast). torch: the reference that the kernel is tested against (slow)."""
+
+    @model_validator(mode="after")
+    def _fits_in_memory(self) -> Network:
+        weights = sum(a * b for a, b in zip(self.hidden, self.hidden[1:], strict=False))
+        if weights > MAX_WEIGHTS:
+            allowed = f"allowed: at most {MAX_WEIGHTS} between hidden layers"
+            raise _refusal(("hidden", f"makes {weights} weights; {allowed}"))
+        return self
 
 
 class Madam(Strict):
@@ -210,11 +228,8 @@ class Madam(Strict):
     @model_validator(mode="after")
     def _ordered(self) -> Madam:
         if self.eta_max < self.eta:
-            raise PydanticCustomError(
-                "eta_order",
-                "eta_max = {eta_max} is below eta = {eta}; allowed: eta_max >= eta",
-                {"eta_max": self.eta_max, "eta": self.eta},
-            )
+            problem = f"is below eta = {self.eta}; allowed: eta_max >= eta"
+            raise _refusal(("eta_max", problem))
         return self
 
 
@@ -231,6 +246,7 @@ class Inertia(Strict):
     """B₂ = M(q)⁻¹ of the controller's nominal model."""
 
     kind: Literal["inertia"]
+    """B from a nominal model."""
     masses: Positives | None = None
     """Masses that the controller believes (kg); null: the plant's."""
     lengths: Positives | None = None
@@ -241,6 +257,7 @@ class Constant(Strict):
     """B₂ = b·I: no model at all."""
 
     kind: Literal["constant"]
+    """B without a model."""
     b: Positive = 1.0
     """Control effectiveness (1/(kg·m²))."""
 
@@ -257,7 +274,7 @@ class Inversion(Strict):
     """λ of the slack matrix B_s = [I; -λI] (1/s). The paper leaves B_s open."""
     slack_matrix: Matrix | None = None
     """A general slack matrix B_s, 2n rows of n; it replaces lam."""
-    effectiveness: Effectiveness = Field(default_factory=lambda: Inertia(kind="inertia"))
+    effectiveness: Effectiveness = Inertia(kind="inertia")
     """What the controller takes for B."""
 
     @model_validator(mode="after")
@@ -266,15 +283,12 @@ class Inversion(Strict):
             return self
         rows, widths = len(self.slack_matrix), {len(row) for row in self.slack_matrix}
         if widths != {rows // 2} or rows % 2:
-            raise PydanticCustomError(
-                "slack_shape", "slack_matrix must have 2n rows of n numbers each"
-            )
+            problem = "has rows that do not fit; allowed: 2n rows of n numbers each"
+            raise _refusal(("slack_matrix", problem))
         upper = np.array(self.slack_matrix[: rows // 2])
         if np.linalg.matrix_rank(upper) < rows // 2:
-            raise PydanticCustomError(
-                "slack_singular",
-                "the upper n rows of slack_matrix are singular, so [B B_s] has no inverse",
-            )
+            problem = "leaves [B B_s] without an inverse; allowed: regular upper n rows"
+            raise _refusal(("slack_matrix", problem))
         return self
 
 
@@ -282,18 +296,26 @@ class DnnMso(Strict):
     """The paper's controller: the network learns all the dynamics."""
 
     kind: Literal["dnn_mso"]
+    """DNN-MSO."""
     inversion: Inversion = Inversion()
+    """From the desired dynamics to a torque."""
     observer: Observer = Observer()
+    """What the network learns against."""
     network: Network = Network()
+    """The learned dynamics."""
     madam: Madam = Madam()
+    """The weight update."""
 
 
 class NoNetwork(Strict):
     """The paper's controller with the network off: inversion and feedback alone."""
 
     kind: Literal["no_network"]
+    """Dynamic inversion without learning."""
     inversion: Inversion = Inversion()
+    """From the desired dynamics to a torque."""
     observer: Observer = Observer()
+    """What the network learns against."""
     kinematics: bool = True
     """Whether q̇ stands in the upper rows of f̂; false leaves all of f̂ at zero."""
 
@@ -302,18 +324,21 @@ class ClassicalMso(Strict):
     """Eq. 4: known dynamics of the nominal model plus a learned uncertainty d̂."""
 
     kind: Literal["classical_mso"]
+    """The modified state observer with known dynamics."""
     inversion: Inversion = Inversion()
+    """From the desired dynamics to a torque."""
     observer: Observer = Observer()
+    """What the network learns against."""
     network: Network = Network()
+    """The learned dynamics."""
     madam: Madam = Madam()
+    """The weight update."""
 
     @model_validator(mode="after")
     def _needs_a_model(self) -> ClassicalMso:
         if isinstance(self.inversion.effectiveness, Constant):
-            raise PydanticCustomError(
-                "needs_model",
-                "classical_mso knows its dynamics: inversion.effectiveness.kind must be inertia",
-            )
+            problem = "leaves classical_mso without a model of the plant; allowed: inertia"
+            raise _refusal(("inversion.effectiveness.kind", problem))
         return self
 
 
@@ -331,7 +356,7 @@ class Scenario(Strict):
     """One experiment. Where the paper gives a number, it is the default."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
-    """Short name; logs and figures are named after it."""
+    """Letters, digits, '_', '.' and '-', at most 64; logs and figures are named after it."""
     description: str = ""
     """One or two sentences for people."""
     duration: Positive = 10.0
@@ -341,10 +366,15 @@ class Scenario(Strict):
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of the initial weights."""
     plant: Plant = Plant()
+    """The robot."""
     initial: Initial = Initial()
+    """Where it starts; the length of initial.q is the number of joints n."""
     reference: Reference
+    """The motion to follow."""
     controller: Controller
+    """What drives the robot."""
     imperfections: Imperfections = Imperfections()
+    """Limits of the robot's parts; none unless given."""
 
     @property
     def n_joints(self) -> int:
@@ -359,30 +389,22 @@ class Scenario(Strict):
     @model_validator(mode="after")
     def _whole_steps(self) -> Scenario:
         steps = self.duration / self.dt
-        if not 1 <= round(steps) <= MAX_TICKS or abs(steps - round(steps)) > 1e-6:
-            raise PydanticCustomError(
-                "whole_steps",
-                "duration = {duration} is {steps} steps of dt = {dt}; "
-                "allowed: a whole number from 1 to {most}",
-                {"duration": self.duration, "dt": self.dt, "steps": steps, "most": MAX_TICKS},
-            )
+        if not 0.5 < steps <= MAX_TICKS or abs(steps - round(steps)) > 1e-6:
+            allowed = f"allowed: a whole number of steps from 1 to {MAX_TICKS}"
+            raise _refusal(("duration", f"is {steps:.10g} steps of dt = {self.dt}; {allowed}"))
         return self
 
     @model_validator(mode="after")
     def _lengths(self) -> Scenario:
         n = self.n_joints
+        wrong = []
         for path, found, allowed in self._vector_lengths(n):
             if found not in allowed:
-                raise PydanticCustomError(
-                    "vector_length",
-                    "{path} has {found} entries; allowed: {allowed}, since initial.q has {n} joints",
-                    {
-                        "path": path,
-                        "found": found,
-                        "allowed": " or ".join(map(str, sorted(allowed))),
-                        "n": n,
-                    },
-                )
+                choices = " or ".join(map(str, sorted(allowed)))
+                reason = f"since initial.q has {_entries(n)}"
+                wrong.append((path, f"has {_entries(found)}; allowed: {choices}, {reason}"))
+        if wrong:
+            raise _refusal(*wrong)
         return self
 
     def _vector_lengths(self, n: int) -> list[tuple[str, int, set[int]]]:

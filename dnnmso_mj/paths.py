@@ -1,0 +1,100 @@
+"""Where models, scenarios and logs are, in a checkout as in an installed wheel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dnnmso_mj.errors import DnnmsoError, ScenarioError
+from dnnmso_mj.wording import clean, did_you_mean, show
+
+PACKAGE = Path(__file__).resolve().parent
+
+
+def models_dir() -> Path:
+    """The folder of the shipped MJCF models."""
+    return _shipped("models")
+
+
+def scenarios_dir() -> Path:
+    """The folder of the shipped scenarios and their JSON Schema."""
+    return _shipped("scenarios")
+
+
+def logs_dir() -> Path:
+    """Where logs go unless told otherwise: `logs` under the current directory."""
+    return Path.cwd() / "logs"
+
+
+def find_scenario(source: str | Path) -> Path:
+    """Find a scenario by path, or by the name of a shipped one ("paper", "paper.yaml").
+
+    Raises:
+        ScenarioError: no such file, a directory or device, or a name that does not ship.
+    """
+    path = Path(source)
+    if _is_file(path):
+        return path
+    names = _names(scenarios_dir(), ".yaml")
+    name = str(source).removesuffix(".yaml")
+    if name in names:
+        return scenarios_dir() / f"{name}.yaml"
+    problem = "not a regular file" if _exists(path) else "no such file"
+    allowed = f"allowed: a YAML file, or one of the shipped scenarios: {', '.join(names)}"
+    hint = did_you_mean(path.stem, names)
+    raise ScenarioError(f"{clean(str(source)) or '(no name)'}: {problem}; {allowed}{hint}")
+
+
+def find_model(name: str, base: Path | None = None) -> Path:
+    """Find an MJCF by the name of a shipped model, or by path relative to `base`.
+
+    Args:
+        name: as in `plant.model`: "two_link", "arms/mine.xml", "/home/me/mine.xml".
+        base: the scenario's folder; the current directory when left out.
+
+    Returns:
+        Absolute path of the file.
+
+    Raises:
+        ScenarioError: neither a file nor a shipped model; lists what ships.
+    """
+    names = _names(models_dir(), ".xml")
+    path = (base or Path.cwd()) / name
+    # A plain word is a shipped model, whatever else is called so; anything else is a file first.
+    if name not in names and _is_file(path):
+        return path.resolve()
+    if name.removesuffix(".xml") in names:
+        return models_dir() / f"{name.removesuffix('.xml')}.xml"
+    allowed = f"allowed: an MJCF file, or one of the shipped models: {', '.join(names)}"
+    hint = did_you_mean(Path(name).stem, names)
+    raise ScenarioError(f"no model {show(name)} in {clean(str(path.parent))}; {allowed}{hint}")
+
+
+def model_name(path: Path) -> str:
+    """What `find_model` finds `path` by from anywhere: a shipped model's name, else the path."""
+    return path.stem if path.parent == models_dir() else str(path)
+
+
+def _shipped(kind: str) -> Path:
+    # A wheel carries them inside the package; a checkout has them beside it.
+    for folder in (PACKAGE / "data" / kind, PACKAGE.parent / kind):
+        if folder.is_dir():
+            return folder
+    raise DnnmsoError(f"no {kind} folder in or beside {PACKAGE}; install dnnmso_mj again")
+
+
+def _names(folder: Path, suffix: str) -> list[str]:
+    return sorted(path.stem for path in folder.glob(f"*{suffix}"))
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name too long
+        return False
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:
+        return False
