@@ -47,6 +47,7 @@ Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard 
 def main() -> NoReturn:
     """Entry point: run the command line; people's errors are one message and status 2."""
     warnings.showwarning = _show_warning
+    warnings.simplefilter("always", UserWarning)
     try:
         app(prog_name="dnnmso")
     except DnnmsoError as error:

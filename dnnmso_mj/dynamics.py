@@ -11,7 +11,7 @@ distance of the centre of mass c_i and inertia I_i about that centre:
     G = g · [(m₁c₁ + m₂l₁) cos q₁ + m₂c₂ cos(q₁+q₂),  m₂c₂ cos(q₁+q₂)]
 
 A point mass at the tip has c = l, I = 0; a uniform thin rod c = l/2, I = m l²/12.
-Source: Lewis, Dawson, Abdallah, "Robot Manipulator Control", ch. 3; the paper's section 6.
+Source: Lewis, Dawson, Abdallah, "Robot Manipulator Control", ch. 3; the paper's simulation section.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from dnnmso_mj import kernel
-from dnnmso_mj.errors import NonFiniteError
+from dnnmso_mj.errors import MissingExtraError, NonFiniteError
 from dnnmso_mj.network import Shape, TorchNetwork, initial_weights, network_shape
 from dnnmso_mj.scenario import Madam as MadamSpec
 from dnnmso_mj.scenario import Network as NetworkSpec
@@ -158,8 +158,13 @@ class TorchLearner:
     """
 
     def __init__(self, shape: Shape, weights: Array, spec: MadamSpec) -> None:
-        import torch
-
+        try:
+            import torch
+        except ImportError as error:
+            raise MissingExtraError(
+                "controller.network.backend = torch needs torch, which is not installed; "
+                "pip install 'dnnmso_mj[reference]', or use backend: kernel"
+            ) from error
         from dnnmso_mj.madam import Madam
 
         self._torch = torch

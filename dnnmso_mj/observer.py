@@ -39,7 +39,7 @@ class StateObserver:
         self.e_obs = np.zeros(n_states)
 
     def reset(self, x: Array) -> None:
-        """Start at the measured state: X̂₀ = X₀ (paper, section 6)."""
+        """Start at the measured state: X̂₀ = X₀ (the paper's simulation section)."""
         self.x_hat[:] = x
         self.e_obs[:] = 0.0
 

@@ -189,6 +189,11 @@ class NominalModel:
         if isinstance(effectiveness, Inertia):
             masses = effectiveness.masses or scenario.plant.masses
             lengths = effectiveness.lengths or scenario.plant.lengths
+            if (masses is None) != (lengths is None):
+                raise ScenarioError(
+                    "controller.inversion.effectiveness: masses or lengths alone; allowed: both, "
+                    "or none, where plant.masses and plant.lengths are null"
+                )
             if masses is not None and lengths is not None:
                 set_links(spec, scenario.plant.links, masses, lengths)
         self.model = compile_spec(spec, scenario.plant.model)

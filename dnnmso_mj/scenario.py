@@ -339,6 +339,9 @@ class ClassicalMso(Strict):
         if isinstance(self.inversion.effectiveness, Constant):
             problem = "leaves classical_mso without a model of the plant; allowed: inertia"
             raise _refusal(("inversion.effectiveness.kind", problem))
+        if self.network.outputs != "full":
+            problem = "has no meaning for classical_mso, which learns a torque; allowed: full"
+            raise _refusal(("network.outputs", problem))
         return self
 
 
@@ -392,6 +395,14 @@ class Scenario(Strict):
         if not 0.5 < steps <= MAX_TICKS or abs(steps - round(steps)) > 1e-6:
             allowed = f"allowed: a whole number of steps from 1 to {MAX_TICKS}"
             raise _refusal(("duration", f"is {steps:.10g} steps of dt = {self.dt}; {allowed}"))
+        return self
+
+    @model_validator(mode="after")
+    def _observer_is_stable(self) -> Scenario:
+        most, gain = 2.0 / self.dt, max(self.controller.observer.K2)
+        if gain >= most:
+            problem = f"makes a sampled observer unstable; allowed: K2 < 2/dt = {most:g}"
+            raise _refusal(("controller.observer.K2", problem))
         return self
 
     @model_validator(mode="after")

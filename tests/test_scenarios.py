@@ -14,6 +14,7 @@ from jsonschema import Draft202012Validator
 from pydantic import BaseModel
 from ruamel.yaml import YAML
 
+from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading import list_scenarios, load_scenario, scenario_schema
 from dnnmso_mj.paths import models_dir, scenarios_dir
 from dnnmso_mj.scenario import (
@@ -201,3 +202,15 @@ def test_the_schema_takes_one_number_or_a_list_where_the_loader_does(
     file.write_text(json.dumps(data))
     found = load_scenario(file).controller.inversion.K
     assert list(found) == (value if isinstance(value, list) else [value])
+
+
+@pytest.mark.parametrize(
+    ("name", "override", "message"),
+    [
+        ("paper", "controller.observer.K2=2000", "K2 < 2/dt = 2000"),
+        ("classical_mso", "controller.network.outputs=kinematic", "allowed: full"),
+    ],
+)
+def test_values_that_cannot_work_together_are_refused(name, override, message):
+    with pytest.raises(ScenarioError, match=message):
+        load_scenario(name, [override])
