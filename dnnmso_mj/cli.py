@@ -100,7 +100,7 @@ def run(
     with _progress(f"{loaded.name}", loaded.n_ticks) as progress:
         done = run_logged(loaded, out, force=force, progress=progress)
     figures = []
-    if plot:
+    if plot and len(done.trace) > 0:
         from dnnmso_mj.plots import save_figures
 
         figures = save_figures(done.trace, done.log.parent, done.log.stem)
@@ -169,14 +169,15 @@ def plot(
     from dnnmso_mj.reading import read_trace
 
     folder = out or logs[0].parent
+    names = [log.stem for log in logs]
+    if len(set(names)) < len(names):
+        names = [f"{k}-{name}" for k, name in enumerate(names, start=1)]
     traces = [read_trace(log) for log in logs]
-    figures = [
-        figure
-        for log, trace in zip(logs, traces, strict=True)
-        for figure in save_figures(trace, folder, log.stem)
-    ]
+    figures = []
+    for name, trace in zip(names, traces, strict=True):
+        figures += save_figures(trace, folder, name)
     if len(logs) > 1:
-        figures += save_comparison(traces, [log.stem for log in logs], folder)
+        figures += save_comparison(traces, names, folder)
     for figure in figures:
         print(figure)
 

@@ -69,8 +69,17 @@ def build_learner(
     """The learner that a scenario asks for; the same seed gives both backends the same weights."""
     shape = network_shape(network, n_in, n_out)
     weights = initial_weights(shape, network, np.random.default_rng(seed))
-    backend = KernelLearner if network.backend == "kernel" else TorchLearner
-    return backend(shape, weights, madam)
+    if network.backend == "torch":
+        return TorchLearner(shape, weights, madam)
+    warm_up()
+    return KernelLearner(shape, weights, madam)
+
+
+def warm_up() -> None:
+    """Compile the kernel, or load it compiled, so that no tick of a run pays for it."""
+    tiny = KernelLearner(Shape((1, 1), bias=True, activation="sigmoid"), np.ones(2), MadamSpec())
+    tiny.predict(np.ones(1))
+    tiny.learn(np.ones(1))
 
 
 class KernelLearner:

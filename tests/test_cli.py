@@ -206,6 +206,13 @@ def test_plot_draws_figures_and_a_comparison(tmp_path, short_log):
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
 
 
+def test_logs_of_one_name_are_told_apart_in_a_comparison(tmp_path, short_log):
+    done = dnnmso("plot", short_log, short_log, "--out", "figures", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    names = {Path(line).name for line in done.stdout.split()}
+    assert {"1-paper_error.png", "2-paper_error.png", "comparison_error.png"} <= names
+
+
 def test_recover_makes_a_whole_log_of_a_torn_one(tmp_path, short_log):
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(short_log.read_bytes()[:-20_000])

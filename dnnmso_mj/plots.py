@@ -1,0 +1,144 @@
+"""Figures of logs, saved as PNG files."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from dnnmso_mj.drawing import house_style
+from dnnmso_mj.errors import DnnmsoError
+from dnnmso_mj.figures import error_figure, torque_figure, tracking_figure
+from dnnmso_mj.theory_figures import learning_figure, theory_figure
+from dnnmso_mj.trace import Trace
+
+_COLOURS = 64
+
+
+def run_figures(trace: Trace) -> dict[str, Figure]:
+    """tracking, error, torque, learning (only with a network) and theory of one run.
+
+    Raises:
+        DnnmsoError: the run has no tick.
+    """
+    _require_ticks({trace.scenario.name: trace})
+    title, alone = _title(trace), {"actual": trace}
+    with house_style():
+        figures = {
+            "tracking": tracking_figure(alone, title),
+            "error": error_figure(alone, title),
+            "torque": torque_figure(alone, title),
+        }
+        if trace.n_layers:
+            figures["learning"] = learning_figure(trace, title)
+        figures["theory"] = theory_figure(trace, title)
+    return figures
+
+
+def comparison_figures(traces: Sequence[Trace], labels: Sequence[str]) -> dict[str, Figure]:
+    """tracking, error and torque of several runs laid over each other.
+
+    Raises:
+        DnnmsoError: no run, a run without a tick, labels that do not name each run, or runs of
+            robots with different numbers of joints.
+    """
+    runs = _named(traces, labels)
+    _require_ticks(runs)
+    with house_style():
+        return {
+            "tracking": tracking_figure(runs),
+            "error": error_figure(runs),
+            "torque": torque_figure(runs),
+        }
+
+
+def save_figures(trace: Trace, out_dir: Path, stem: str) -> list[Path]:
+    """Write the figures of one run as `out_dir/stem_NAME.png`, replacing older ones whole.
+
+    Raises:
+        DnnmsoError: the run has no tick, or the folder cannot be written; no file is half-written.
+    """
+    figures = run_figures(trace)
+    return _save({out_dir / f"{stem}_{name}.png": figure for name, figure in figures.items()})
+
+
+def save_comparison(traces: Sequence[Trace], labels: Sequence[str], out_dir: Path) -> list[Path]:
+    """Write `out_dir/comparison_NAME.png` of several runs, each named by its label.
+
+    Raises:
+        DnnmsoError: as `comparison_figures`, or the folder cannot be written.
+    """
+    figures = comparison_figures(traces, labels)
+    return _save({out_dir / f"comparison_{name}.png": figure for name, figure in figures.items()})
+
+
+def _title(trace: Trace) -> str:
+    """Scenario and seed, and what became of the run if it did not end well."""
+    title = f"{trace.scenario.name}, seed {trace.info.seed}"
+    if trace.info.status == "ok":
+        return title
+    return f"{title}: {trace.info.status} at t = {trace['t'][-1]:g} s"
+
+
+def _named(traces: Sequence[Trace], labels: Sequence[str]) -> dict[str, Trace]:
+    """Runs by their labels, which must fit them."""
+    if not traces or len(labels) != len(traces) or len(set(labels)) != len(labels):
+        raise DnnmsoError(
+            f"labels {list(labels)} for {len(traces)} runs; "
+            "allowed: at least one run, and one label of its own for each"
+        )
+    joints = {trace.n_joints for trace in traces}
+    if len(joints) > 1:
+        raise DnnmsoError(
+            f"runs with {sorted(joints)} joints cannot be compared; "
+            "allowed: robots with the same number of joints"
+        )
+    as_text = (label.replace("$", r"\$") for label in labels)  # not as formulas
+    return dict(zip(as_text, traces, strict=True))
+
+
+def _require_ticks(runs: Mapping[str, Trace]) -> None:
+    for label, trace in runs.items():
+        if len(trace) == 0:
+            raise DnnmsoError(f"run {label} has 0 ticks: nothing to draw; needed: at least 1")
+
+
+def _save(figures: Mapping[Path, Figure]) -> list[Path]:
+    """Render everything, write it beside its place, and only then move it there."""
+    with house_style():
+        rendered = {path: _png(figure) for path, figure in figures.items()}
+    parts: dict[Path, Path] = {}
+    try:
+        for path, png in rendered.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            parts[path] = path.with_name(f".{path.name}.{os.getpid()}.part")
+            parts[path].write_bytes(png)
+        for path, part in parts.items():
+            part.replace(path)
+    except OSError as error:
+        raise DnnmsoError(
+            f"cannot write figure {path}: {error.strerror}; choose a folder that can be written"
+        ) from None
+    finally:
+        for part in parts.values():
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+    return list(rendered)
+
+
+def _png(figure: Figure) -> bytes:
+    """PNG of few colours: a fourth of the size, and nobody can tell."""
+    canvas: Any = FigureCanvasAgg(figure)  # its methods carry no types
+    canvas.draw()
+    size = canvas.get_width_height(physical=True)
+    picture = Image.frombytes("RGBA", size, bytes(canvas.buffer_rgba())).convert("RGB")
+    buffer = io.BytesIO()
+    picture.quantize(_COLOURS, dither=Image.Dither.NONE).save(buffer, "png")
+    return buffer.getvalue()
