@@ -9,7 +9,7 @@ import json
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -103,7 +103,8 @@ def run(
     if plot and len(done.trace) > 0:
         from dnnmso_mj.plots import save_figures
 
-        figures = save_figures(done.trace, done.log.parent, done.log.stem)
+        with _working("drawing figures"):
+            figures = save_figures(done.trace, done.log.parent, done.log.stem)
     info = done.trace.info
     if as_json:
         print(json.dumps({
@@ -140,7 +141,8 @@ def check(
 
     one = [links for links in LINKS if links == model]
     mjcf = Mjcf.read(find_model("two_link" if one else model))
-    results = [check_dynamics(mjcf, links, states, seed) for links in one or LINKS]
+    with _working("comparing"):
+        results = [check_dynamics(mjcf, links, states, seed) for links in one or LINKS]
     passed = all(result.passed for result in results)
     if as_json:
         errors = {result.links: result.errors for result in results}
@@ -174,10 +176,11 @@ def plot(
         names = [f"{k}-{name}" for k, name in enumerate(names, start=1)]
     traces = [read_trace(log) for log in logs]
     figures = []
-    for name, trace in zip(names, traces, strict=True):
-        figures += save_figures(trace, folder, name)
-    if len(logs) > 1:
-        figures += save_comparison(traces, names, folder)
+    with _working("drawing figures"):
+        for name, trace in zip(names, traces, strict=True):
+            figures += save_figures(trace, folder, name)
+        if len(logs) > 1:
+            figures += save_comparison(traces, names, folder)
     for figure in figures:
         print(figure)
 
@@ -193,9 +196,13 @@ def replay(
     from dnnmso_mj import replay as viewer
 
     if save is not None:
-        print(viewer.save_rrd(log, save))
+        with _working("converting"):
+            viewer.save_rrd(log, save)
+        print(save)
     if screenshot is not None:
-        print(viewer.screenshot(log, screenshot))
+        with _working("drawing"):
+            viewer.screenshot(log, screenshot)
+        print(screenshot)
     if serve:
         viewer.serve(log)
     elif save is None and screenshot is None:
@@ -267,6 +274,12 @@ def scenarios(as_json: Json = False) -> None:
     for name, text in found:
         table.add_row(name, text)
     Console().print(table)
+
+
+def _working(what: str) -> AbstractContextManager[object]:
+    """A spinner on standard error, when that is a terminal, for work of unknown length."""
+    console = Console(stderr=True)
+    return console.status(f"{what} …") if console.is_terminal else nullcontext()
 
 
 @contextmanager

@@ -97,7 +97,8 @@ class TwoLink:
         _, _, _, first, second = self._lumped
         kinetic = 0.5 * np.einsum("...i,...ij,...j", qd, self.inertia(q), qd)
         heights = first * np.sin(q[..., 0]) + second * np.sin(q[..., 0] + q[..., 1])
-        return kinetic + self.gravity * heights
+        energy: Array = kinetic + self.gravity * heights
+        return energy
 
 
 def centre_and_inertia(links: Links, mass: float, length: float) -> tuple[float, float]:

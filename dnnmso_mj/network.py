@@ -72,7 +72,7 @@ def network_shape(spec: NetworkSpec, n_in: int, n_out: int) -> Shape:
 
 
 def initial_weights(shape: Shape, spec: NetworkSpec, rng: np.random.Generator) -> Array:
-    """Draw W_l ~ N(0, c/√fan_in), c = 3.6 for the sigmoid (Kumar 2017; the paper's simulation section).
+    """Draw W_l ~ N(0, c/√fan_in), c = 3.6 for the sigmoid (Kumar 2017; simulation section).
 
     N.B. the paper prints c/√L and does not say whether it is a standard deviation or a variance:
     `init_spread` chooses. fan_in counts the constant input.

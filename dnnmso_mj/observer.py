@@ -45,7 +45,8 @@ class StateObserver:
 
     def compare(self, x: Array) -> Array:
         """e_a = X − X̂ (2n,) for the measured state x (2n,)."""
-        return np.subtract(x, self.x_hat, out=self.e_obs)
+        np.subtract(x, self.x_hat, out=self.e_obs)
+        return self.e_obs
 
     def advance(self, f_hat: Array, Bu: Array) -> None:
         """Integrate X̂ over one period with f̂ (2n,), B u (2n,) and the last e_a."""
