@@ -241,6 +241,25 @@ def test_urdf_limits_only_what_the_model_limits() -> None:
     assert (twist.attrib["lower"], twist.attrib["upper"]) == ("-3.0", "3.0")
 
 
+@MODELS
+def test_urdf_loads_in_rerun(model: mujoco.MjModel, tmp_path: Path) -> None:
+    import rerun as rr
+    from rerun.chunk import RrdReader
+
+    scene, urdf, rrd = Scene(model), tmp_path / "robot.urdf", tmp_path / "robot.rrd"
+    urdf.write_text(scene.urdf())
+    recording = rr.RecordingStream("test")
+    recording.save(rrd)
+    recording.log_file_from_path(urdf, static=True)
+    recording.disconnect()
+    chunks = list(RrdReader(rrd).stream())
+    shown = {"/".join(chunk.entity_path.split("/")[-2:]) for chunk in chunks}
+    assert {f"{geom.body}/{geom.name}" for geom in scene.geoms} <= shown
+    frames = next(c.to_record_batch() for c in chunks if c.entity_path == "/tf_static")
+    children = frames["Transform3D:child_frame"].to_pylist()
+    assert {child for row in children for child in row} == {link.name for link in scene.links}
+
+
 @pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9])
 def test_roll_pitch_yaw_keep_every_digit_up_to_a_right_angle(pitch: float) -> None:
     angles, axes = (0.7, pitch, -0.4), np.eye(3)[::-1]
