@@ -114,7 +114,7 @@ def test_an_unknown_group_is_one_message_and_exit_status_two():
         [sys.executable, SCRIPT, "nonsense"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
-    assert "GROUP = nonsense: unknown; allowed: width" in done.stderr
+    assert "GROUP = nonsense: unknown; allowed: headline" in done.stderr
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
 
