@@ -1,0 +1,204 @@
+"""Rerun's programs as child processes: started, waited for, and never left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, TypeVar
+
+from dnnmso_mj.errors import DnnmsoError, MissingExtraError
+
+if TYPE_CHECKING:
+    from rerun.experimental import ViewerClient
+
+Result = TypeVar("Result")
+
+LOCAL = "127.0.0.1"  # Rerun's own default, 0.0.0.0, would show the log to the whole network
+_START_S = 60.0  # a busy machine that draws in software starts a viewer well within it
+_POLL_S = 0.05
+_END_S = 5.0
+# Unlike `python -m rerun_cli` this passes the exit status on, and ends its process group when its
+# standard input does: when we are gone, even if killed.
+_RERUN = """
+import os, signal, sys, threading
+from rerun_cli.__main__ import main
+def follow():
+    sys.stdin.read()
+    os.killpg(0, signal.SIGTERM)
+threading.Thread(target=follow, daemon=True).start()
+sys.exit(main())
+"""
+
+
+@contextlib.contextmanager
+def rerun(*arguments: str) -> Iterator[RerunProcess]:
+    """Run the command `rerun` with these arguments; end it, its children included, on leaving."""
+    with tempfile.TemporaryFile() as messages:
+        process = subprocess.Popen(  # noqa: S603
+            [sys.executable, "-c", _RERUN, "--bind", LOCAL, *arguments],
+            # RERUN_APP_ONLY: no question about usage statistics at the first start.
+            env={**os.environ, "RERUN_APP_ONLY": "true", "RUST_LOG": "error"},
+            stdin=subprocess.PIPE,
+            stdout=messages,
+            stderr=messages,
+            start_new_session=True,  # a group of its own: Ctrl-C is for us, and we end it all
+        )
+        try:
+            yield RerunProcess(process, messages)
+        finally:
+            _end(process)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, number)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_END_S)
+            return
+
+
+class RerunProcess:
+    """A Rerun program that `rerun` started.
+
+    Args:
+        process: it.
+        messages: the file that its output goes to.
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes], messages: IO[bytes]) -> None:
+        self._process = process
+        self._messages = messages
+
+    def wait(self) -> None:
+        """Wait for its end.
+
+        Raises:
+            DnnmsoError: it failed; says why.
+        """
+        if self._process.wait() != 0:
+            raise DnnmsoError(f"Rerun's viewer failed: {self.complaint()}")
+
+    def wait_until(self, ready: Callable[[], Result | None], what: str) -> Result:
+        """Ask until an answer is true, and return it.
+
+        Raises:
+            DnnmsoError: the program ended first, or a minute has passed.
+        """
+        deadline = time.monotonic() + _START_S
+        while time.monotonic() < deadline:
+            if self._process.poll() is not None:
+                raise DnnmsoError(f"Rerun's viewer ended before {what}: {self.complaint()}")
+            if answer := ready():
+                return answer
+            time.sleep(_POLL_S)
+        raise DnnmsoError(f"Rerun's viewer was not {what} after {_START_S:g} s. Try again.")
+
+    def complaint(self) -> str:
+        """What it said on its way out, in one line."""
+        self._messages.seek(0)
+        text = re.sub(r"\x1b\[[0-9;]*m", "", self._messages.read().decode(errors="replace"))
+        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        telling = [line for line in lines if "panicked at" in line or line.startswith("Error")]
+        return (telling or lines or ["it gave no reason"])[-1]
+
+
+@contextlib.contextmanager
+def headless_viewer(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
+    """A viewer without a window, that has loaded a recording, as a client to command it by.
+
+    Args:
+        rrd: the recording.
+        size: width and height (pixels).
+
+    Raises:
+        MissingExtraError: the system has no Vulkan driver to draw with.
+    """
+    from rerun.experimental import ViewerClient
+
+    port, (width, height) = free_port(), size
+    arguments = ("--headless", "--port", str(port), "--window-size", f"{width}x{height}")
+    with rerun(*arguments, str(rrd)) as process:
+
+        def connected() -> ViewerClient | None:
+            try:
+                client = ViewerClient.connect(f"rerun+http://{LOCAL}:{port}/proxy")
+                state = client.get_state()
+            except (ConnectionError, RuntimeError):  # not yet
+                return None
+            loaded = not state.loading and any(r.timelines for r in state.recordings)
+            return client if loaded else None
+
+        try:
+            client = process.wait_until(connected, "ready")
+        except DnnmsoError as error:
+            if "render context" in str(error) or "adapter" in str(error):
+                raise MissingExtraError(
+                    f"{error} A viewer without a window needs a Vulkan driver. On Debian and "
+                    "Ubuntu: apt-get install mesa-vulkan-drivers libvulkan1"
+                ) from error
+            raise
+        try:
+            yield client
+        except (ConnectionError, RuntimeError) as error:
+            raise DnnmsoError(f"Rerun's viewer failed: {error}: {process.complaint()}") from error
+
+
+def picture(client: ViewerClient) -> bytes:
+    """What a viewer shows, as PNG, once it has stopped changing.
+
+    Raises:
+        DnnmsoError: a view reports that it cannot show its data, or the picture never settles.
+    """
+    deadline, last = time.monotonic() + _START_S, b""
+    while time.monotonic() < deadline:
+        shown = client.take_screenshot()
+        if shown == last:
+            break
+        last = shown
+    else:
+        raise DnnmsoError(
+            f"the viewer's picture was still changing after {_START_S:g} s. Try again."
+        )
+    problems = [f"{v.name}: {r.summary}" for v in client.get_state().views for r in v.reports]
+    if problems:
+        raise DnnmsoError("the viewer cannot show all views: " + "; ".join(problems))
+    return shown
+
+
+def free_port() -> int:
+    """A port of this machine that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind((LOCAL, 0))
+        return int(probe.getsockname()[1])
+
+
+def listens(port: int) -> bool:
+    """Whether somebody listens on a port of this machine."""
+    with socket.socket() as probe:
+        return probe.connect_ex((LOCAL, port)) == 0
+
+
+def check_port(port: int) -> None:
+    """Refuse a port that cannot be listened on.
+
+    Raises:
+        DnnmsoError: it is taken, or not ours to take.
+    """
+    try:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((LOCAL, port))
+    except (OSError, OverflowError) as error:
+        raise DnnmsoError(
+            f"port {port} of {LOCAL} cannot be used: {error}. Allowed: a free one, 1024 to 65535."
+        ) from error
