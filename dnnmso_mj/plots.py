@@ -13,10 +13,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from dnnmso_mj.drawing import house_style
 from dnnmso_mj.errors import DnnmsoError
-from dnnmso_mj.figures import error_figure, torque_figure, tracking_figure
-from dnnmso_mj.theory_figures import learning_figure, theory_figure
+from dnnmso_mj.figures.drawing import house_style
+from dnnmso_mj.figures.theory import learning_figure, theory_figure
+from dnnmso_mj.figures.tracking import error_figure, torque_figure, tracking_figure
 from dnnmso_mj.trace import Trace
 
 _COLOURS = 64

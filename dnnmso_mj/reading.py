@@ -12,7 +12,7 @@ from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Sch
 from pydantic import ValidationError
 
 from dnnmso_mj.errors import LogError
-from dnnmso_mj.log_format import (
+from dnnmso_mj.log.format import (
     EVENTS,
     STEP,
     create,
@@ -23,9 +23,9 @@ from dnnmso_mj.log_format import (
     snapshot_place,
     unwritable,
 )
-from dnnmso_mj.mcap_prefix import Prefix, copy
+from dnnmso_mj.log.prefix import Prefix, copy
+from dnnmso_mj.log.step_message import StepFormat, check_schema, layout_of
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.step_message import StepFormat, check_schema, layout_of
 from dnnmso_mj.trace import Event, RunInfo, Trace
 
 Array = np.ndarray

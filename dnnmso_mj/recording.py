@@ -19,7 +19,7 @@ from typing import Self
 import numpy as np
 
 from dnnmso_mj.errors import LogError
-from dnnmso_mj.log_format import (
+from dnnmso_mj.log.format import (
     EVENTS,
     MODEL,
     NS_PER_S,
@@ -35,10 +35,7 @@ from dnnmso_mj.log_format import (
     snapshot_name,
     unwritable,
 )
-from dnnmso_mj.provenance import git_commit, software_versions
-from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.scene import Scene
-from dnnmso_mj.scene_messages import (
+from dnnmso_mj.log.scene_messages import (
     ROBOT_DESCRIPTION,
     SCENE,
     TF,
@@ -46,7 +43,10 @@ from dnnmso_mj.scene_messages import (
     robot_description,
     scene_update,
 )
-from dnnmso_mj.step_message import StepFormat
+from dnnmso_mj.log.step_message import StepFormat
+from dnnmso_mj.provenance import git_commit, software_versions
+from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.scene import Scene
 from dnnmso_mj.trace import Event, RunInfo, StepLayout
 
 Array = np.ndarray

@@ -18,14 +18,13 @@ from types import FrameType
 from mcap.records import Attachment
 
 from dnnmso_mj.errors import DnnmsoError, LogError, MissingExtraError, ScenarioError
-from dnnmso_mj.log_format import MODEL, unwritable
-from dnnmso_mj.mcap_prefix import Prefix
+from dnnmso_mj.log.format import MODEL, unwritable
+from dnnmso_mj.log.prefix import Prefix
 from dnnmso_mj.plant import Mjcf, build_spec, compile_spec
 from dnnmso_mj.reading import read_trace
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.signals import TIMELINE
-from dnnmso_mj.viewer import (
+from dnnmso_mj.viewer.process import (
     LOCAL,
     check_port,
     free_port,
@@ -34,6 +33,7 @@ from dnnmso_mj.viewer import (
     picture,
     rerun,
 )
+from dnnmso_mj.viewer.signals import TIMELINE
 
 
 def save_rrd(log: Path, out: Path, first_tab: str = "Tracking") -> Path:
@@ -140,7 +140,7 @@ def screenshot(
 def _convert(log: Path, out: Path, first_tab: str) -> float:
     """Write the recording of a log; returns the time of the run's last tick (s)."""
     try:
-        from dnnmso_mj.rrd import rrd_bytes
+        from dnnmso_mj.viewer.rrd import rrd_bytes
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "rerun":
             raise

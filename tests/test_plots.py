@@ -19,8 +19,8 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from PIL import Image
 
-from dnnmso_mj.drawing import envelope, log_line, panels
 from dnnmso_mj.errors import DnnmsoError
+from dnnmso_mj.figures.drawing import envelope, log_line, panels
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.plots import comparison_figures, run_figures, save_comparison, save_figures
 from dnnmso_mj.scenario import Scenario

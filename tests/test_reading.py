@@ -21,9 +21,9 @@ from test_recording import full_disk
 from test_step_message import as_message
 
 from dnnmso_mj.errors import LogError
-from dnnmso_mj.log_format import STEP
+from dnnmso_mj.log.format import STEP
+from dnnmso_mj.log.step_message import StepFormat
 from dnnmso_mj.reading import log_info, read_snapshots, read_trace, recover
-from dnnmso_mj.step_message import StepFormat
 from dnnmso_mj.trace import FLAGS, SCALARS, Event, RunInfo
 
 COUNT = 230

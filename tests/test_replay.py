@@ -17,8 +17,8 @@ from dnnmso_mj.reading import read_trace
 from dnnmso_mj.replay import save_rrd
 from dnnmso_mj.run import run_logged
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.signals import Plot, joint_color, plot_tabs
 from dnnmso_mj.trace import Array, Trace
+from dnnmso_mj.viewer.signals import Plot, joint_color, plot_tabs
 
 SHORT = ("duration=0.6", "controller.network.hidden=[8, 8]")
 SHAPE = ("plant.lengths=[0.7, 1.2]", "plant.masses=[1.0, 1.5]", "imperfections.torque_limit=45")
@@ -288,7 +288,7 @@ def test_logarithm_of_an_exact_zero_is_a_gap(trace: Trace) -> None:
 
 
 def test_one_tick_is_enough(trace: Trace, scene: Scene, tmp_path: Path) -> None:
-    from dnnmso_mj.rrd import rrd_bytes
+    from dnnmso_mj.viewer.rrd import rrd_bytes
 
     first = replace(trace, columns={name: trace[name][:1] for name in trace})
     (tmp_path / "one.rrd").write_bytes(rrd_bytes(first, scene))
@@ -305,7 +305,7 @@ def test_a_torn_log_is_shown_up_to_its_tear(log: Path, tmp_path: Path) -> None:
 
 
 def test_ten_thousand_ticks_stay_under_15_megabytes(trace: Trace, scene: Scene) -> None:
-    from dnnmso_mj.rrd import rrd_bytes
+    from dnnmso_mj.viewer.rrd import rrd_bytes
 
     rng = np.random.default_rng(0)  # numbers that no compression makes smaller
     columns = {name: rng.uniform(size=(10_000, *trace[name].shape[1:])) for name in trace}

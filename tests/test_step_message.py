@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from log_samples import LAYOUT, rows
 
-from dnnmso_mj.step_message import SCHEMA_NAME, StepFormat, check_schema, layout_of, schema
+from dnnmso_mj.log.step_message import SCHEMA_NAME, StepFormat, check_schema, layout_of, schema
 from dnnmso_mj.trace import FLAGS, SCALARS, StepLayout
 
 

@@ -23,8 +23,8 @@ from dnnmso_mj.errors import DnnmsoError, LogError, MissingExtraError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.replay import open_viewer, save_rrd, screenshot, serve
 from dnnmso_mj.run import run_logged
-from dnnmso_mj.signals import JOINT_COLORS
-from dnnmso_mj.viewer import LOCAL, free_port, headless_viewer, listens, picture, rerun
+from dnnmso_mj.viewer.process import LOCAL, free_port, headless_viewer, listens, picture, rerun
+from dnnmso_mj.viewer.signals import JOINT_COLORS
 
 DRIVERS = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]
 HAS_VULKAN = ctypes.util.find_library("vulkan") is not None and any(
@@ -195,14 +195,15 @@ def test_a_port_that_does_not_exist_is_refused(log: Path, port: int) -> None:
 
 
 @pytest.fixture
-def server(log: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+def server(log: Path, tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """A process that serves the log, and the address that it printed."""
     code = (
         "import sys; from pathlib import Path; from dnnmso_mj.replay import serve\n"
         "serve(Path(sys.argv[1]), int(sys.argv[2]))"
     )
     command = [sys.executable, "-c", code, str(log), str(free_port())]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}  # what a killed one leaves goes there
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout is not None
         yield process, process.stdout.readline().strip()
         process.terminate()

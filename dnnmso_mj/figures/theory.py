@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dnnmso_mj.drawing import (
+from dnnmso_mj.figures.drawing import (
     COLOURS,
     DASHED,
     INK,

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from dnnmso_mj.drawing import (
+from dnnmso_mj.figures.drawing import (
     COLOURS,
     DASHED,
     INK,

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
-from dnnmso_mj.signals import TIMELINE, Plot
+from dnnmso_mj.viewer.signals import TIMELINE, Plot
 
 Point = tuple[float, float, float]
 

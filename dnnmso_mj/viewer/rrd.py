@@ -9,12 +9,12 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from dnnmso_mj.arm_picture import send_arms, stage
-from dnnmso_mj.blueprint import EVENTS, PLOTS, SUMMARY, replay_blueprint
 from dnnmso_mj.errors import LogError
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.signals import THIN, TIMELINE, Plot, plot_tabs
 from dnnmso_mj.trace import Array, Event, Trace
+from dnnmso_mj.viewer.arm_picture import send_arms, stage
+from dnnmso_mj.viewer.blueprint import EVENTS, PLOTS, SUMMARY, replay_blueprint
+from dnnmso_mj.viewer.signals import THIN, TIMELINE, Plot, plot_tabs
 
 APPLICATION = "dnnmso"
 TICKS = "tick"
@@ -125,5 +125,5 @@ def _summary(trace: Trace) -> str:
 
 
 def _drawable(text: str) -> str:
-    """Text without the characters that would end a headless viewer; see `dnnmso_mj.signals`."""
+    """Text without the characters that would end a headless viewer; see `signals`."""
     return _NOT_DRAWN.sub("?", text)

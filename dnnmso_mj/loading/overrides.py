@@ -15,10 +15,10 @@ from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
-from dnnmso_mj.complaints import Complaint, complain
-from dnnmso_mj.documents import read_document
 from dnnmso_mj.errors import ScenarioError
-from dnnmso_mj.shape import ABSENT, Shape, lookup
+from dnnmso_mj.loading.complaints import Complaint, complain
+from dnnmso_mj.loading.documents import read_document
+from dnnmso_mj.loading.shape import ABSENT, Shape, lookup
 from dnnmso_mj.wording import KeyPath, clean, dotted, show
 
 FORM = "allowed: KEY.PATH=VALUE, as in plant.gravity=1.62"

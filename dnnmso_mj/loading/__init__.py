@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from dnnmso_mj.complaints import Complaint, complain, explain
-from dnnmso_mj.documents import Node, Problem, read_document
 from dnnmso_mj.dynamics import centre_and_inertia
 from dnnmso_mj.errors import ScenarioError
-from dnnmso_mj.overrides import Override, apply_overrides, parse_overrides
+from dnnmso_mj.loading.complaints import Complaint, complain, explain
+from dnnmso_mj.loading.documents import Node, Problem, read_document
+from dnnmso_mj.loading.overrides import Override, apply_overrides, parse_overrides
+from dnnmso_mj.loading.shape import ABSENT, Shape, lookup, scenario_schema
 from dnnmso_mj.paths import find_model, find_scenario, model_name, scenarios_dir
 from dnnmso_mj.scenario import Plant, Scenario, expand
-from dnnmso_mj.shape import ABSENT, Shape, lookup, scenario_schema
 from dnnmso_mj.wording import clean
 
 __all__ = ["ScenarioWarning", "list_scenarios", "load_scenario", "scenario_schema"]
@@ -36,7 +36,7 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
 
     Args:
         source: a YAML file, or the name of a shipped scenario ("paper").
-        overrides: `--set` strings, "plant.gravity=1.62"; see `dnnmso_mj.overrides`.
+        overrides: `--set` strings, "plant.gravity=1.62"; see `dnnmso_mj.loading.overrides`.
 
     Returns:
         The scenario. Its plant.model is a shipped model's name or an absolute path. A relative

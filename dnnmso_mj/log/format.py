@@ -19,8 +19,8 @@ from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.writer import CompressionType, Writer
 
-from dnnmso_mj import step_message
 from dnnmso_mj.errors import LogError
+from dnnmso_mj.log import step_message
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.trace import Event, RunInfo
 

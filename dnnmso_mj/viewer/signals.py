@@ -1,7 +1,7 @@
 """What a replay plots: the columns of a trace as titled plots of named, coloured lines.
 
-What the viewer shows beside the arm is decided here, once: `dnnmso_mj.rrd` writes the lines,
-`dnnmso_mj.blueprint` lays out the plots, and neither knows what they mean.
+What the viewer shows beside the arm is decided here, once: `dnnmso_mj.viewer.rrd` writes the lines,
+`dnnmso_mj.viewer.blueprint` lays out the plots, and neither knows what they mean.
 
 The viewer's font has Latin, Greek, ² and ₁₀, but few combining accents; a headless viewer ends at a
 character that it has not (ᵀ, for one).

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from dnnmso_mj.shape import ABSENT, Shape, lookup
+from dnnmso_mj.loading.shape import ABSENT, Shape, lookup
 from dnnmso_mj.wording import KeyPath, did_you_mean, dotted, show
 
 _KINDS = {

@@ -21,7 +21,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 
-from dnnmso_mj.log_format import Topic, protobuf_topic, timestamp
+from dnnmso_mj.log.format import Topic, protobuf_topic, timestamp
 from dnnmso_mj.rotations import rotate
 from dnnmso_mj.scene import WORLD, Geom, Scene
 

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from dnnmso_mj.blueprint import ARM, DESIRED, TRAIL, Point
 from dnnmso_mj.rotations import from_rotation_vector
 from dnnmso_mj.scene import WORLD, Geom, Joint, Scene
-from dnnmso_mj.signals import joint_color
+from dnnmso_mj.viewer.blueprint import ARM, DESIRED, TRAIL, Point
+from dnnmso_mj.viewer.signals import joint_color
 
 Array = np.ndarray
 Rgba = tuple[int, int, int, int]
@@ -50,7 +50,8 @@ def send_arms(
             pin = _pin(link.joint, 0.02 * reach)
             recording.log(f"{frames[link.name]}/shapes/pin", pin, static=True)
     radius = 0.004 * reach
-    path = rr.LineStrips3D([scene.tip(q_ref)], colors=PATH_RGB, radii=radius)
+    # Thinner than the trail, which so covers it where the tip has kept to it.
+    path = rr.LineStrips3D([scene.tip(q_ref)], colors=PATH_RGB, radii=0.6 * radius)
     recording.log(f"{TRAIL}/desired", path, static=True)
     _send_trail(recording, times, scene.tip(q), radius)
 

@@ -1,0 +1,1 @@
+"""The figures behind `dnnmso_mj.plots`."""

@@ -1,0 +1,1 @@
+"""The log of a run, byte by byte: what its writer and its readers share."""

@@ -1,0 +1,1 @@
+"""The Rerun viewer behind `dnnmso_mj.replay`."""
