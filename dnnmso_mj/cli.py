@@ -191,20 +191,23 @@ def replay(
     save: Annotated[Path | None, typer.Option(help="Write a Rerun recording (.rrd).")] = None,
     screenshot: Annotated[Path | None, typer.Option(help="Write a picture (.png).")] = None,
     serve: Annotated[bool, typer.Option(help="Serve the web viewer on 127.0.0.1.")] = False,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Of --serve.")] = 9090,
+    at: Annotated[float | None, typer.Option(help="Time of --screenshot (s).")] = None,
+    tab: Annotated[str, typer.Option(help="Open tab of --save and --screenshot.")] = "Tracking",
 ) -> None:
     """Open a log in the Rerun viewer."""
     from dnnmso_mj import replay as viewer
 
     if save is not None:
         with _working("converting"):
-            viewer.save_rrd(log, save)
+            viewer.save_rrd(log, save, tab)
         print(save)
     if screenshot is not None:
         with _working("drawing"):
-            viewer.screenshot(log, screenshot)
+            viewer.screenshot(log, screenshot, t=at, tab=tab)
         print(screenshot)
     if serve:
-        viewer.serve(log)
+        viewer.serve(log, port)
     elif save is None and screenshot is None:
         viewer.open_viewer(log)
 

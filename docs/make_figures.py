@@ -29,6 +29,9 @@ def main() -> None:
         plain = Path(folder) / "paper_no_network_tracking.png"
         shutil.copy(plain, IMAGES / "tracking_no_network.png")
         screenshot(logs["paper"], IMAGES / "replay_tracking.png")
+        screenshot(logs["paper"], IMAGES / "replay_learning.png", tab="Learning")
+        screenshot(logs["paper"], IMAGES / "replay_theory.png", tab="Theory")
+        screenshot(logs["paper_no_network"], IMAGES / "replay_no_network.png", t=7.5)
     for image in sorted(IMAGES.glob("*.png")):
         print(image)
 

@@ -143,6 +143,7 @@ REFUSALS = [
     (("recover", "nothing.mcap"), "nothing.mcap"),
     (("plot", "nothing.mcap"), "nothing.mcap"),
     (("replay", "nothing.mcap", "--save", "x.rrd"), "nothing.mcap"),
+    (("replay", "nothing.mcap", "--serve", "--port", "0"), "--port"),
     (("check", "--model", "nowhere.xml"), "nowhere.xml"),
     (("check", "--states", "0"), "--states"),
     (("run",), "SCENARIO"),

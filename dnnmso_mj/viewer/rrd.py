@@ -57,7 +57,7 @@ def rrd_bytes(trace: Trace, scene: Scene, first_tab: str = "Tracking") -> bytes:
     layout = replay_blueprint(tabs, centre, half_size, events=has_events, first_tab=first_tab)
     recording = rr.RecordingStream(APPLICATION)
     memory = recording.memory_recording()
-    recording.send_blueprint(layout)
+    recording.send_blueprint(layout)  # active at once: served, a mere default is lost at times
     recording.send_recording_name(f"{trace.scenario.name}, seed {trace.info.seed}")
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     send_arms(recording, scene, _times(trace["t"][ticks], ticks), q, q_ref)
