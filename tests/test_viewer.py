@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes.util
 import os
 import re
 import signal
@@ -18,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from vulkan import needs_vulkan
 
 from dnnmso_mj.errors import DnnmsoError, LogError, MissingExtraError
 from dnnmso_mj.loading import load_scenario
@@ -26,13 +26,6 @@ from dnnmso_mj.run import run_logged
 from dnnmso_mj.viewer.process import LOCAL, free_port, headless_viewer, listens, picture, rerun
 from dnnmso_mj.viewer.signals import JOINT_COLORS
 
-DRIVERS = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]
-HAS_VULKAN = ctypes.util.find_library("vulkan") is not None and any(
-    folder.is_dir() and any(folder.iterdir()) for folder in DRIVERS
-)
-needs_vulkan = pytest.mark.skipif(
-    not HAS_VULKAN, reason="no Vulkan driver: apt-get install mesa-vulkan-drivers libvulkan1"
-)
 SIZE = (1200, 700)
 TRAIL = (255, 220, 90)
 
