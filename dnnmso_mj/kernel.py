@@ -4,8 +4,9 @@
 weight is in hand forms its gradient, its second moment, its update and the sums that theory needs.
 Nothing is allocated. The torch reference is `dnnmso_mj.network` with `dnnmso_mj.madam`.
 
-Arrays: `sizes` (L+1,) layer widths; `w`, `v` flat weights and second moments ḡ²; `acts` the
-activations of all layers with each layer's constant input behind it; `stats` (L, 5).
+Arrays, all float64 or all float32: `w`, `v` flat weights and second moments ḡ²; `acts` the
+activations of all layers with each layer's constant input behind it, `deltas` likewise. `sizes`
+(L+1,) are the layer widths.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ def forward(w: Array, sizes: Array, bias: bool, activation: int, x: Array, acts:
     """Run the network on x (n_in,). Returns where its output begins in `acts`."""
     n_layers = sizes.size - 1
     extra = 1 if bias else 0
+    real = w.dtype.type
     acts[: sizes[0]] = x
     acts[sizes[0]] = 1.0
     a, start = 0, 0
@@ -52,17 +54,17 @@ def forward(w: Array, sizes: Array, bias: bool, activation: int, x: Array, acts:
         inputs = acts[a : a + columns]
         for i in range(n_out):
             row = w[start + i * columns : start + (i + 1) * columns]
-            z = 0.0
+            z = real(0.0)
             for j in range(columns):
                 z += row[j] * inputs[j]
-            if layer < n_layers - 1:
-                if activation == 0:
-                    z = 1.0 / (1.0 + math.exp(-z))
-                elif activation == 1:
-                    z = math.tanh(z)
-                else:
-                    z = max(z, 0.0)
-            acts[out + i] = z
+            if layer == n_layers - 1:
+                acts[out + i] = z
+            elif activation == 0:
+                acts[out + i] = 1.0 / (1.0 + math.exp(-z))
+            elif activation == 1:
+                acts[out + i] = math.tanh(z)
+            else:
+                acts[out + i] = max(z, real(0.0))
         acts[out + n_out] = 1.0
         a = out
         start += n_out * columns
@@ -80,18 +82,22 @@ def _slope(activation: int, a: float) -> float:
 
 
 @compiled
-def _exp(x: float) -> float:
-    """exp(x) for |x| ≤ 1 to 1e-14, without a call, so that the loop around it vectorises."""
-    y = x * 0.125
-    p = 1.0 + y * (1.0 / 9.0)
-    p = 1.0 + y * (1.0 / 8.0) * p
-    p = 1.0 + y * (1.0 / 7.0) * p
-    p = 1.0 + y * (1.0 / 6.0) * p
-    p = 1.0 + y * (1.0 / 5.0) * p
-    p = 1.0 + y * (1.0 / 4.0) * p
-    p = 1.0 + y * (1.0 / 3.0) * p
-    p = 1.0 + y * (1.0 / 2.0) * p
-    p = 1.0 + y * p
+def _exp(x: float, real: type[float]) -> float:
+    """exp(x) for |x| ≤ 1 to 1e-14, without a call, so that the loop around it vectorises.
+
+    `real` is the type of the weights: a plain 1.0 would widen float32 to float64.
+    """
+    one = real(1.0)
+    y = x * real(0.125)
+    p = one + y * real(1.0 / 9.0)
+    p = one + y * real(1.0 / 8.0) * p
+    p = one + y * real(1.0 / 7.0) * p
+    p = one + y * real(1.0 / 6.0) * p
+    p = one + y * real(1.0 / 5.0) * p
+    p = one + y * real(1.0 / 4.0) * p
+    p = one + y * real(1.0 / 3.0) * p
+    p = one + y * real(1.0 / 2.0) * p
+    p = one + y * p
     p = p * p
     p = p * p
     return p * p
@@ -103,29 +109,34 @@ def _madam_row(
 ) -> None:
     """Update one neuron's weights from its error `delta`, and pass the error back through them.
 
-    `madam` holds η, η*/η, σ*, β and the bias correction 1 − βᵏ (1 without it).
+    Args:
+        madam: η, η*/η, σ*, β, 1/(1 − βᵏ) or 1 without bias correction, and the smallest normal
+            number, which stands for ḡ² = 0 so that 0/0 is no update.
+        sums: the layer's row of `stats`.
     """
-    eta, most, sigma_max, beta, correction = madam[0], madam[1], madam[2], madam[3], madam[4]
-    w_sq = g_sq = gw = dw_sq = clipped = 0.0
+    real = w.dtype.type
+    eta, most, sigma_max, beta = madam[0], madam[1], madam[2], madam[3]
+    correction, tiny = madam[4], madam[5]
+    fresh = real(1.0) - beta
+    w_sq = gw = dw_sq = clipped = real(0.0)
     for j in range(w.size):
         wj = w[j]
         back[j] += wj * delta
         g = delta * inputs[j]
-        vj = (1.0 - beta) * (g * g) + beta * v[j]
+        vj = fresh * (g * g) + beta * v[j]
         v[j] = vj
-        ratio = g / math.sqrt(vj / correction) if vj > 0.0 else 0.0
+        ratio = g / math.sqrt(max(vj * correction, tiny))
         step = min(max(ratio, -most), most)
-        sign = 1.0 if wj > 0.0 else (-1.0 if wj < 0.0 else 0.0)
-        grown = wj * _exp(-eta * sign * step)
+        # A weight of zero stays zero, whatever sign copysign gives it.
+        grown = wj * _exp(-math.copysign(eta, wj) * step, real)
         new = min(max(grown, -sigma_max), sigma_max)
         w[j] = new
+        change = new - wj
         w_sq += wj * wj
-        g_sq += g * g
         gw += abs(g * wj)
-        dw_sq += (new - wj) * (new - wj)
-        clipped += 1.0 if (step != ratio or new != grown) else 0.0
+        dw_sq += change * change
+        clipped += abs(step - ratio) + abs(new - grown)
     sums[0] += w_sq
-    sums[1] += g_sq
     sums[2] += gw
     sums[3] += dw_sq
     sums[4] += clipped
@@ -148,14 +159,15 @@ def learn(
     Args:
         acts: as `forward` left it.
         deltas: like `acts`; its output slots hold ∂loss/∂f̂ and stay, the rest is overwritten.
-        madam: η, η*/η, σ*, β, bias correction.
-        stats: (L, 5) out: Σw², Σg², Σ|g||w|, ΣΔw² and the number of clamped updates, from before
-            the update.
+        madam: see `_madam_row`; in the type of w.
+        stats: (L, 5) out, float64: Σw², Σg², Σ|g||w|, ΣΔw² and how far updates were clamped, from
+            before the update.
     """
     n_layers = sizes.size - 1
     extra = 1 if bias else 0
     start = w.size
     out = acts.size - sizes[n_layers] - 1
+    real = w.dtype.type
     stats[:] = 0.0
     for layer in range(n_layers - 1, -1, -1):
         n_out, n_in = sizes[layer + 1], sizes[layer]
@@ -164,10 +176,12 @@ def learn(
         a = out - n_in - 1
         inputs, back = acts[a : a + columns], deltas[a : a + columns]
         back[:] = 0.0
+        delta_sq = 0.0
         for i in range(n_out):
             delta = deltas[out + i]
             if layer < n_layers - 1:
-                delta *= _slope(activation, acts[out + i])
+                delta = real(delta * _slope(activation, acts[out + i]))
+            delta_sq += delta * delta
             row = start + i * columns
             _madam_row(
                 w[row : row + columns],
@@ -178,6 +192,10 @@ def learn(
                 madam,
                 stats[layer],
             )
+        inputs_sq = 0.0
+        for j in range(columns):
+            inputs_sq += inputs[j] * inputs[j]
+        stats[layer, G_SQ] = delta_sq * inputs_sq  # g is the outer product of both
         out = a
 
 

@@ -7,11 +7,13 @@ is `predict`, then `learn` with the gradient of the loss by the network's output
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numba.core import event
 
 from dnnmso_mj import kernel
 from dnnmso_mj.errors import MissingExtraError, NonFiniteError
@@ -71,15 +73,33 @@ def build_learner(
     weights = initial_weights(shape, network, np.random.default_rng(seed))
     if network.backend == "torch":
         return TorchLearner(shape, weights, madam)
-    warm_up()
+    weights = weights.astype(network.precision)
+    warm_up(weights.dtype)
     return KernelLearner(shape, weights, madam)
 
 
-def warm_up() -> None:
+class _CompileNotice(event.Listener):
+    """Says once, on standard error, why the first run of all takes seconds longer."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def on_start(self, event: event.Event) -> None:
+        if not self._said:
+            self._said = True
+            print("compiling the network kernel; later runs load it", file=sys.stderr, flush=True)
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+def warm_up(precision: np.dtype) -> None:
     """Compile the kernel, or load it compiled, so that no tick of a run pays for it."""
-    tiny = KernelLearner(Shape((1, 1), bias=True, activation="sigmoid"), np.ones(2), MadamSpec())
-    tiny.predict(np.ones(1))
-    tiny.learn(np.ones(1))
+    shape = Shape((1, 1), bias=True, activation="sigmoid")
+    with event.install_listener("numba:compile", _CompileNotice()):
+        tiny = KernelLearner(shape, np.ones(2, precision), MadamSpec())
+        tiny.predict(np.ones(1))
+        tiny.learn(np.ones(1))
 
 
 class KernelLearner:
@@ -87,7 +107,8 @@ class KernelLearner:
 
     Args:
         shape: layer sizes.
-        weights: flat initial weights (n_weights,); taken over.
+        weights: flat initial weights (n_weights,), float64 or float32, which is the precision that
+            the network learns in; taken over.
         spec: Madam's parameters.
     """
 
@@ -98,18 +119,23 @@ class KernelLearner:
         self._updates = 0
         self._sizes = np.array(shape.sizes)
         self._activation = kernel.ACTIVATIONS[shape.activation]
-        self._acts = np.zeros(kernel.activations_size(shape.sizes))
+        self._acts = np.zeros(kernel.activations_size(shape.sizes), weights.dtype)
         self._deltas = np.zeros_like(self._acts)
         out = self._acts.size - shape.sizes[-1] - 1
         self._output, self._delta = self._acts[out:-1], self._deltas[out:-1]
         self._stats = np.zeros((shape.n_layers, 5))
-        self._madam = np.array([spec.eta, spec.eta_max / spec.eta, spec.sigma_max, spec.beta, 1.0])
-        self._x = np.zeros(shape.sizes[0])
+        most, tiny = spec.eta_max / spec.eta, float(np.finfo(weights.dtype).tiny)
+        madam = [spec.eta, most, spec.sigma_max, spec.beta, 1.0, tiny]
+        self._madam = np.array(madam, weights.dtype)
+        self._x = np.zeros(shape.sizes[0], weights.dtype)
+        self._prediction = np.zeros(shape.sizes[-1])
         self._before, self._after = np.zeros_like(weights), np.zeros_like(weights)
 
     def predict(self, x: Array) -> Array:
-        self._forward(x)
-        return self._output
+        self._x[:] = x
+        self._forward()
+        self._prediction[:] = self._output
+        return self._prediction
 
     def learn(self, delta: Array) -> None:
         shape = self.shape
@@ -119,7 +145,7 @@ class KernelLearner:
             self._gradient(self._before)
         self._updates += 1
         if self.spec.bias_correction:
-            self._madam[4] = 1.0 - self.spec.beta**self._updates
+            self._madam[4] = 1.0 / (1.0 - self.spec.beta**self._updates)
         kernel.learn(
             self._w, self._v, self._sizes, shape.bias, self._activation,
             self._acts, self._deltas, self._madam, self._stats,
@@ -128,8 +154,9 @@ class KernelLearner:
         if sampled:
             self._measure_gradient_change()
 
-    def _forward(self, x: Array) -> None:
-        kernel.forward(self._w, self._sizes, self.shape.bias, self._activation, x, self._acts)
+    def _forward(self) -> None:
+        bias, code = self.shape.bias, self._activation
+        kernel.forward(self._w, self._sizes, bias, code, self._x, self._acts)
 
     def _gradient(self, g: Array) -> None:
         kernel.gradient(
@@ -137,8 +164,7 @@ class KernelLearner:
         )
 
     def _measure_gradient_change(self) -> None:
-        self._x[:] = self._acts[: self._x.size]
-        self._forward(self._x)
+        self._forward()
         self._gradient(self._after)
         self.monitors.gradient_change[:] = gradient_change(self.shape, self._before, self._after)
 

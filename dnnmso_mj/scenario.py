@@ -201,6 +201,8 @@ class Network(Strict):
     """Factor on the initial weights of the output layer."""
     backend: Literal["kernel", "torch"] = "kernel"
     """kernel: compiled (fast). torch: the reference that the kernel is tested against (slow)."""
+    precision: Literal["float64", "float32"] = "float64"
+    """Arithmetic of the kernel; float32 is faster. The torch reference is always float64."""
 
     @model_validator(mode="after")
     def _fits_in_memory(self) -> Network:

@@ -8,8 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from dnnmso_mj.learner import warm_up
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
 
@@ -22,6 +24,12 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
     if os.environ.get("DNNMSO_NO_SKIPS") and reporter.stats.get("skipped") and exitstatus == 0:
         reporter.write_line("skipped tests are not allowed with DNNMSO_NO_SKIPS", red=True)
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_kernel() -> None:
+    """Compile once, so that no test of a command line sees the notice that it does."""
+    warm_up(np.dtype(np.float64))
 
 
 @pytest.fixture(scope="session")
