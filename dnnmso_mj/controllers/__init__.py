@@ -8,7 +8,9 @@ from typing import Protocol
 
 import numpy as np
 
+from dnnmso_mj.inversion import DynamicInversion
 from dnnmso_mj.learner import Monitors
+from dnnmso_mj.observer import StateObserver
 from dnnmso_mj.plant import Mjcf, NominalModel
 from dnnmso_mj.scenario import ClassicalMso, DnnMso, NoNetwork, Scenario
 
@@ -34,6 +36,17 @@ class Command:
     """Observer error X − X̂ (2n,)."""
     monitors: Monitors = field(default_factory=lambda: Monitors.zeros(0))
     """Monitors of the network's update; empty without a network."""
+
+    @classmethod
+    def of(cls, inversion: DynamicInversion, observer: StateObserver, f_hat: Array) -> Command:
+        """A command that shows what these parts hold, without copying it on each tick."""
+        return cls(
+            tau=inversion.tau,
+            Bu=inversion.Bu,
+            x_hat=np.zeros_like(observer.x_hat),
+            f_hat=f_hat,
+            e_obs=observer.e_obs,
+        )
 
 
 class Controller(Protocol):

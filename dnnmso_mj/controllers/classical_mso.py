@@ -48,14 +48,8 @@ class ClassicalMsoController:
         self.learner = build_learner(spec.network, spec.madam, 2 * n, n, seed)
         self.n_layers = self.learner.shape.n_layers
         self._f_hat, self._f_obs = np.zeros(2 * n), np.zeros(2 * n)
-        self._command = Command(
-            tau=self.inversion.tau,
-            Bu=self.inversion.Bu,
-            x_hat=np.zeros(2 * n),
-            f_hat=self._f_hat,
-            e_obs=self.observer.e_obs,
-            monitors=self.learner.monitors,
-        )
+        self._command = Command.of(self.inversion, self.observer, self._f_hat)
+        self._command.monitors = self.learner.monitors
 
     def reset(self, x: Array) -> None:
         self.observer.reset(x)

@@ -40,13 +40,7 @@ class NoNetworkController:
         self.inversion = DynamicInversion(spec.inversion, n, nominal)
         self.observer = StateObserver(spec.observer, 2 * n, dt)
         self._f_hat = np.zeros(2 * n)
-        self._command = Command(
-            tau=self.inversion.tau,
-            Bu=self.inversion.Bu,
-            x_hat=np.zeros(2 * n),
-            f_hat=self._f_hat,
-            e_obs=self.observer.e_obs,
-        )
+        self._command = Command.of(self.inversion, self.observer, self._f_hat)
 
     def reset(self, x: Array) -> None:
         self.observer.reset(x)
