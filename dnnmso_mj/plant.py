@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -31,18 +32,38 @@ INTEGRATORS = {
 
 @dataclass(frozen=True)
 class Mjcf:
-    """An MJCF as text, with the folder that its includes and assets are relative to."""
+    """An MJCF as text without includes, and the folder that its assets are relative to."""
 
     text: str
     folder: str = ""
 
     @classmethod
     def read(cls, path: Path) -> Mjcf:
-        """Read the file at `path`. Raises ScenarioError when it cannot be read as text."""
+        """Read the file at `path`, its includes put in their places.
+
+        Raises:
+            ScenarioError: a file cannot be read, or one with includes is not XML.
+        """
         try:
-            return cls(path.read_text(encoding="utf-8"), str(path.parent))
-        except (OSError, UnicodeDecodeError) as error:
+            text = path.read_text(encoding="utf-8")
+            if "<include" in text:
+                root = ElementTree.fromstring(text)  # noqa: S314
+                _put_in_includes(root, path.parent)
+                text = ElementTree.tostring(root, encoding="unicode")
+        except (OSError, UnicodeDecodeError, ElementTree.ParseError, RecursionError) as error:
             raise ScenarioError(f"plant.model: cannot read {path}: {error}") from error
+        return cls(text, str(path.parent))
+
+
+def _put_in_includes(element: ElementTree.Element, folder: Path) -> None:
+    """Replace each <include file="…"/> by what stands in that file; paths are from `folder`."""
+    for place, child in reversed(list(enumerate(element))):
+        if child.tag == "include":
+            part = ElementTree.parse(folder / child.get("file", "")).getroot()  # noqa: S314
+            _put_in_includes(part, folder)
+            element[place : place + 1] = list(part)
+        else:
+            _put_in_includes(child, folder)
 
 
 def build_spec(plant: PlantSpec, dt: float, mjcf: Mjcf) -> mujoco.MjSpec:

@@ -13,7 +13,8 @@ with them. If ‖d‖ ≤ ε after some time, then ultimately ‖s‖ ≤ ε/K a
 `TrackingBounds` integrates these comparison equations with the true ‖d(t)‖: that holds during the
 transient too, and settles at the ultimate bound when ‖d‖ does. The paper's own bound,
 ‖e_r‖ ≤ ε/λ_min(K) with ‖f̃‖ ≤ ε, is integrated likewise; it presumes an inversion of all 2n rows,
-which slack variables do not give.
+which slack variables do not give. Both are bounds of the continuous arm: RK4 keeps to them, while
+MuJoCo's Euler adds up to dt/2·Δė of its own to e, which can exceed a very small bound.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
@@ -117,6 +119,7 @@ def test_dm_control_steps_the_same_model_to_the_same_state(make_scenario, two_li
             '<joint name="joint2"/><joint name="b" type="ball"/>',
             "hinges and slides",
         ),
+        ('ctrllimited="false"', 'ctrlrange="-1 1"', "without ctrlrange"),
         ('name="link2"', 'name="forearm"', "no body 'link2'"),
         ("<worldbody>", "<wordbody>", "MuJoCo says"),
     ],
@@ -125,6 +128,36 @@ def test_models_it_cannot_drive_are_refused_by_name(make_scenario, two_link, old
     assert old in two_link.text
     with pytest.raises(ScenarioError, match=message):
         Plant(make_scenario(), Mjcf(two_link.text.replace(old, new)))
+
+
+def test_includes_are_put_in_and_assets_found_beside_the_model(make_scenario, two_link, tmp_path):
+    part = re.search(r"  <sensor>.*</sensor>\n", two_link.text, re.DOTALL).group()
+    (tmp_path / "inner.xml").write_text(f"<mujocoinclude>{part}</mujocoinclude>")
+    outer = '<mujocoinclude><include file="inner.xml"/></mujocoinclude>'
+    (tmp_path / "outer.xml").write_text(outer)
+    (tmp_path / "hand.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    mesh = '<asset><mesh name="hand" file="hand.obj" inertia="legacy"/></asset><worldbody>'
+    text = two_link.text.replace(part, '<include file="outer.xml"/>')
+    text = text.replace("<worldbody>", mesh, 1)
+    text = text.replace(
+        '<site name="tip"', '<geom name="hand" type="mesh" mesh="hand"/><site name="tip"'
+    )
+    (tmp_path / "arm.xml").write_text(text)
+    read = Mjcf.read(tmp_path / "arm.xml")
+    model = Plant(make_scenario(), read).model
+    assert (model.nsensor, model.nmesh) == (4, 1)
+    with pytest.raises(ScenarioError, match=r"hand\.obj"):
+        Plant(make_scenario(), Mjcf(read.text, "elsewhere"))
+
+
+def test_an_include_that_is_missing_or_includes_itself_is_refused(two_link, tmp_path):
+    text = two_link.text.replace("<sensor>", '<include file="arm.xml"/><sensor>')
+    for name, content in (("arm.xml", text), ("lost.xml", text.replace("arm.xml", "no.xml"))):
+        (tmp_path / name).write_text(content)
+        with pytest.raises(ScenarioError, match="cannot read"):
+            Mjcf.read(tmp_path / name)
 
 
 def test_a_model_with_another_number_of_joints_is_refused(make_scenario, two_link):

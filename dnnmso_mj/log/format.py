@@ -90,7 +90,9 @@ def _open_new(path: Path) -> BinaryIO:
     try:
         return path.open("xb")
     except FileExistsError as error:
-        raise LogError(f"{path} exists already. Choose another name, or remove it.") from error
+        raise LogError(
+            f"{path} exists already. Choose another name, or replace it with --force."
+        ) from error
 
 
 def unwritable(path: Path, error: OSError) -> LogError:
