@@ -93,7 +93,7 @@ class DynamicInversion:
         np.dot(self._coupling, r[:n], out=acceleration)
         acceleration += r[n:]
         if not self._constant:
-            self._B2_inv = self._nominal.inertia(x[:n])
+            self._B2_inv[:] = self._nominal.inertia(x[:n])
         return np.dot(self._B2_inv, acceleration, out=self.tau)
 
     def effect(self, tau: Array) -> Array:
@@ -101,8 +101,3 @@ class DynamicInversion:
         Bu = np.zeros(2 * self._n)
         Bu[self._n :] = np.linalg.solve(self._B2_inv, tau)
         return Bu
-
-    def effectiveness(self) -> Array:
-        """B₂ (n, n) at the state of the last command."""
-        B2: Array = np.linalg.inv(self._B2_inv)
-        return B2

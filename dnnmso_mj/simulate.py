@@ -28,6 +28,7 @@ Progress = Callable[[int], None]
 
 # rad, rad/s: no arm is there and comes back.
 DIVERGED_ABOVE = 1e3
+MUJOCO_ZEROES_ABOVE = 1e9  # N·m; from 1e10 on MuJoCo drops a torque with a mere warning
 BLOCK = 1024  # ticks between two looks at the reference, progress and interrupts
 SNAPSHOT_PERIOD = 1.0  # s
 
@@ -149,6 +150,8 @@ class Simulation:
         tau = self.actuators.apply(command.tau)
         if not math.isfinite(tau.sum()):
             raise NonFiniteError("tau", command.tau.tolist())
+        if np.abs(tau).max() > MUJOCO_ZEROES_ABOVE:
+            raise NonFiniteError("tau", f"{tau.tolist()}, above {MUJOCO_ZEROES_ABOVE:g}")
         self._true_dynamics(command, tau)
         self._fill(command, tau)
         self._check_finite(row)

@@ -130,3 +130,22 @@ def test_a_weight_held_at_its_largest_counts_as_clipped(w, clipped):
     learner.learn(-np.ones(1))
     assert learner.monitors.clipped is clipped
     assert learner.state()["weights"][0] <= 1.0
+
+
+def test_a_torque_that_mujoco_would_drop_ends_the_run(make_scenario):
+    trace = simulate(make_scenario(plant={"masses": [1e9, 1e9]}, duration=0.01))
+    assert trace.info.status == "diverged"
+    assert trace.info.reason.startswith("tau = ")
+
+
+def test_true_dynamics_of_the_classical_mso_hold_where_the_torque_saturates(make_scenario):
+    nominal = {"effectiveness": {"kind": "inertia", "masses": [0.8, 1.6]}}
+    limits = {"torque_limit": [60.0, 30.0]}
+    controller = {"kind": "classical_mso", "inversion": nominal}
+    trace = simulate(make_scenario(controller, duration=1.0, imperfections=limits))
+    q, tau = trace["q"], trace["tau"]
+    qdd = TwoLink((1.0, 2.3), (1.0, 1.0)).acceleration(q, trace["qd"], tau)
+    M = TwoLink((0.8, 1.6), (1.0, 1.0)).inertia(q)
+    expected = qdd - np.linalg.solve(M, tau[..., None])[..., 0]
+    assert trace["saturated"].any()
+    assert np.allclose(trace["f_true"][:, 2:], expected, rtol=1e-8, atol=1e-8)
