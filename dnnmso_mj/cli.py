@@ -155,7 +155,7 @@ def check(
         for result in results:
             cells = [f"{error:.1e}" for error in result.errors.values()]
             table.add_row(result.links, *cells, "ok" if result.passed else "FAILED")
-        Console().print(table)
+        Console(markup=False).print(table)
         print(f"allowed: {TOLERANCE:g} for each")
     if not passed:
         raise typer.Exit(DIVERGED)
@@ -241,7 +241,7 @@ def info(log: Log, as_json: Json = False) -> None:
         table.add_row(name, _number(value))
     for event in found.events:
         table.add_row(f"event {event.t:.3f} s", f"{event.level}: {event.message}")
-    Console().print(table)
+    Console(markup=False).print(table)
 
 
 @app.command()
@@ -276,7 +276,7 @@ def scenarios(as_json: Json = False) -> None:
     table = Table("name", "description")
     for name, text in found:
         table.add_row(name, text)
-    Console().print(table)
+    Console(markup=False).print(table)
 
 
 def _working(what: str) -> AbstractContextManager[object]:
@@ -306,7 +306,7 @@ def _print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
     table.add_column("unit")
     for name, value in info.metrics.items():
         table.add_row(name, _number(value), UNITS.get(name, ""))
-    console = Console(soft_wrap=True)
+    console = Console(soft_wrap=True, markup=False)
     console.print(table)
     simulated = len(trace) * trace.scenario.dt
     print(f"{simulated:g} s simulated in {info.wall_s:.2f} s")
