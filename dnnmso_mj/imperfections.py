@@ -2,34 +2,39 @@
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 
+from dnnmso_mj.compiling import inner
 from dnnmso_mj.scenario import Imperfections, expand
 
 Array = np.ndarray
 
 
-class Actuators:
-    """τ = clamp(τ_cmd, ±τ_max), each joint by its own limit.
+class Actuators(NamedTuple):
+    """τ = clamp(τ_cmd, ±τ_max), each joint by its own limit."""
 
-    Args:
-        spec: the scenario's imperfections.
-        n_joints: n.
+    tau: Array  # (n,) N·m, what reaches the joints
+    limit: Array  # (n,) N·m; infinite without one
 
-    Attributes:
-        saturated: whether the last `apply` clamped anything.
-    """
 
-    def __init__(self, spec: Imperfections, n_joints: int) -> None:
-        limit = spec.torque_limit
-        self._limit = None if limit is None else expand(limit, n_joints)
-        self._tau = np.zeros(n_joints)
-        self.saturated = False
+def build_actuators(spec: Imperfections, n_joints: int) -> Actuators:
+    """The actuators of a scenario."""
+    limit = spec.torque_limit
+    limits = np.full(n_joints, np.inf) if limit is None else expand(limit, n_joints)
+    return Actuators(np.zeros(n_joints), limits)
 
-    def apply(self, tau_cmd: Array) -> Array:
-        """Torque (n,) N·m that reaches the joints; overwritten by the next call."""
-        if self._limit is None:
-            return tau_cmd
-        np.clip(tau_cmd, -self._limit, self._limit, out=self._tau)
-        self.saturated = not np.array_equal(self._tau, tau_cmd)
-        return self._tau
+
+@inner
+def actuate(actuators: Actuators, tau_cmd: Array) -> bool:
+    """Pass a command (n,) N·m through; whether anything was clamped."""
+    saturated = False
+    for i in range(tau_cmd.size):
+        tau, limit = tau_cmd[i], actuators.limit[i]
+        if abs(tau) > limit:
+            tau = math.copysign(limit, tau)
+            saturated = True
+        actuators.tau[i] = tau
+    return saturated

@@ -16,9 +16,13 @@ uses this closed form; `invert_augmented` is the general inverse it is tested ag
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 
-from dnnmso_mj.plant import NominalModel
+from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.plant import Nominal, inertia
 from dnnmso_mj.scenario import Constant, expand
 from dnnmso_mj.scenario import Inversion as InversionSpec
 
@@ -54,50 +58,76 @@ def invert_augmented(B: Array, B_s: Array, r: Array, u_s: Array) -> tuple[Array,
     return U[:n], U[n:]
 
 
-class DynamicInversion:
-    """The inversion law at the control period.
+class DynamicInversion(NamedTuple):
+    """The inversion law at the control period, and its last command."""
 
-    Args:
-        spec: K (1/s), the slack matrix and what the controller takes for B.
-        n_joints: n.
-        nominal: the controller's own model, needed when B₂ = M(q)⁻¹.
+    tau: Array  # u (n,) N·m
+    Bu: Array  # B u (2n,), its effect as the controller sees it
+    B2_inv: Array  # (n, n) of the last command
+    K: Array  # (2n,) 1/s
+    coupling: Array  # Λ (n, n)
+    r: Array  # (2n,)
+    nominal: Nominal  # the controller's own model, read where B₂ = M(q)⁻¹
+    constant: bool  # B₂ = b·I
 
-    Attributes:
-        tau: u (n,) N·m, the last command.
-        Bu: B u (2n,), its effect as the controller sees it.
-    """
 
-    def __init__(self, spec: InversionSpec, n_joints: int, nominal: NominalModel) -> None:
-        n = n_joints
-        self._n = n
-        self._K = expand(spec.K, 2 * n)
-        self._coupling = slack_coupling(slack_matrix(spec, n))
-        self._nominal = nominal
-        effectiveness = spec.effectiveness
-        self._constant = isinstance(effectiveness, Constant)
-        b = effectiveness.b if isinstance(effectiveness, Constant) else 1.0
-        self._B2_inv: Array = np.eye(n) / b
-        self._r = np.zeros(2 * n)
-        self._scratch = np.zeros(2 * n)
-        self.tau = np.zeros(n)
-        self.Bu = np.zeros(2 * n)
+def build_inversion(spec: InversionSpec, n_joints: int, nominal: Nominal) -> DynamicInversion:
+    """The inversion of a scenario for n joints, with the controller's own model."""
+    n = n_joints
+    effectiveness = spec.effectiveness
+    b = effectiveness.b if isinstance(effectiveness, Constant) else 1.0
+    return DynamicInversion(
+        tau=np.zeros(n),
+        Bu=np.zeros(2 * n),
+        B2_inv=np.eye(n) / b,
+        K=expand(spec.K, 2 * n),
+        coupling=np.ascontiguousarray(slack_coupling(slack_matrix(spec, n))),
+        r=np.zeros(2 * n),
+        nominal=nominal,
+        constant=isinstance(effectiveness, Constant),
+    )
 
-    def command(self, x: Array, x_ref: Array, xd_ref: Array, f_hat: Array) -> Array:
-        """u = B₂⁻¹ (r₂ + Λ r₁) for state x, reference x_ref, its derivative, and f̂, each (2n,)."""
-        n, r = self._n, self._r
-        e_track = np.subtract(x, x_ref, out=self._scratch)
-        np.multiply(self._K, e_track, out=r)
-        np.subtract(xd_ref, r, out=r)
-        r -= f_hat
-        acceleration = self.Bu[n:]
-        np.dot(self._coupling, r[:n], out=acceleration)
-        acceleration += r[n:]
-        if not self._constant:
-            self._B2_inv[:] = self._nominal.inertia(x[:n])
-        return np.dot(self._B2_inv, acceleration, out=self.tau)
 
-    def effect(self, tau: Array) -> Array:
-        """B τ (2n,) of another torque, e.g. a saturated one, at the state of the last command."""
-        Bu = np.zeros(2 * self._n)
-        Bu[self._n :] = np.linalg.solve(self._B2_inv, tau)
-        return Bu
+@inner
+def invert(
+    inversion: DynamicInversion, x: Array, x_ref: Array, xd_ref: Array, f_hat: Array
+) -> None:
+    """u = B₂⁻¹ (r₂ + Λ r₁) for state x, reference x_ref, its derivative, and f̂, each (2n,)."""
+    n, r = inversion.tau.size, inversion.r
+    for i in range(2 * n):
+        r[i] = xd_ref[i] - f_hat[i] - inversion.K[i] * (x[i] - x_ref[i])
+    acceleration = inversion.Bu[n:]
+    for i in range(n):
+        acceleration[i] = r[n + i]
+        for j in range(n):
+            acceleration[i] += inversion.coupling[i, j] * r[j]
+    if not inversion.constant:
+        inertia(inversion.nominal, x[:n])
+        for i in range(n):
+            copy(inversion.nominal.M[i], inversion.B2_inv[i])
+    for i in range(n):
+        inversion.tau[i] = 0.0
+        for j in range(n):
+            inversion.tau[i] += inversion.B2_inv[i, j] * acceleration[j]
+
+
+@compiled
+def solve_spd(A: Array, b: Array, x: Array, L: Array) -> None:
+    """x = A⁻¹ b for symmetric positive definite A (n, n), by Cholesky; L (n, n) is scratch."""
+    n = b.size
+    for i in range(n):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = math.sqrt(total) if i == j else total / L[j, j]
+    for i in range(n):
+        total = b[i]
+        for k in range(i):
+            total -= L[i, k] * x[k]
+        x[i] = total / L[i, i]
+    for i in range(n - 1, -1, -1):
+        total = x[i]
+        for k in range(i + 1, n):
+            total -= L[k, i] * x[k]
+        x[i] = total / L[i, i]

@@ -96,7 +96,7 @@ class TorchNetwork:
 
     Args:
         shape: layer sizes.
-        weights: flat initial weights (n_weights,); copied.
+        weights: flat initial weights (n_weights,), whose precision becomes its own; copied.
     """
 
     def __init__(self, shape: Shape, weights: Array) -> None:
@@ -104,9 +104,7 @@ class TorchNetwork:
 
         self._torch = torch
         self.shape = shape
-        self.parameters = [
-            torch.tensor(W, dtype=torch.float64, requires_grad=True) for W in shape.split(weights)
-        ]
+        self.parameters = [torch.tensor(W, requires_grad=True) for W in shape.split(weights)]
         self._activation = {"sigmoid": torch.sigmoid, "tanh": torch.tanh, "relu": torch.relu}[
             shape.activation
         ]

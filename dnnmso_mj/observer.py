@@ -9,49 +9,49 @@ The classical MSO (Eq. 4) is the same observer with f̂ = f(X̂) + B d̂.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from dnnmso_mj.compiling import compiled, copy, inner
 from dnnmso_mj.scenario import Observer as ObserverSpec
 from dnnmso_mj.scenario import expand
 
 Array = np.ndarray
 
 
-class StateObserver:
-    """The observer at the control period: explicit Euler, since f̂, u and X are held for a period.
+class StateObserver(NamedTuple):
+    """The observer at the control period: explicit Euler, since f̂, u and X are held in it."""
 
-    Args:
-        spec: gain K₂ (1/s) and the sign of its feedback.
-        n_states: 2n.
-        dt: control period (s).
+    x_hat: Array  # X̂ (2n,)
+    e_obs: Array  # e_a (2n,) of the last `compare`
+    gain: Array  # K₂ (2n,) with the sign of its feedback
+    dt: float  # s
 
-    Attributes:
-        x_hat: X̂ (2n,).
-        e_obs: e_a = X − X̂ (2n,) of the last `compare`.
-    """
 
-    def __init__(self, spec: ObserverSpec, n_states: int, dt: float) -> None:
-        sign = 1.0 if spec.feedback == "stable" else -1.0
-        self._dt = dt
-        self._gain = sign * expand(spec.K2, n_states)
-        self._rate = np.zeros(n_states)
-        self.x_hat = np.zeros(n_states)
-        self.e_obs = np.zeros(n_states)
+def build_observer(spec: ObserverSpec, n_states: int, dt: float) -> StateObserver:
+    """The observer of a scenario for 2n states and control period dt (s)."""
+    sign = 1.0 if spec.feedback == "stable" else -1.0
+    gain = sign * expand(spec.K2, n_states)
+    return StateObserver(np.zeros(n_states), np.zeros(n_states), gain, dt)
 
-    def reset(self, x: Array) -> None:
-        """Start at the measured state: X̂₀ = X₀ (the paper's simulation section)."""
-        self.x_hat[:] = x
-        self.e_obs[:] = 0.0
 
-    def compare(self, x: Array) -> Array:
-        """e_a = X − X̂ (2n,) for the measured state x (2n,)."""
-        np.subtract(x, self.x_hat, out=self.e_obs)
-        return self.e_obs
+@compiled
+def start(observer: StateObserver, x: Array) -> None:
+    """Start at the measured state x (2n,): X̂₀ = X₀ (the paper's simulation section)."""
+    copy(x, observer.x_hat)
 
-    def advance(self, f_hat: Array, Bu: Array) -> None:
-        """Integrate X̂ over one period with f̂ (2n,), B u (2n,) and the last e_a."""
-        rate = np.multiply(self._gain, self.e_obs, out=self._rate)
-        rate += f_hat
-        rate += Bu
-        rate *= self._dt
-        self.x_hat += rate
+
+@inner
+def compare(observer: StateObserver, x: Array) -> None:
+    """e_a = X − X̂ for the measured state x (2n,)."""
+    for i in range(x.size):
+        observer.e_obs[i] = x[i] - observer.x_hat[i]
+
+
+@inner
+def advance(observer: StateObserver, f_hat: Array, Bu: Array) -> None:
+    """Integrate X̂ over one period with f̂ (2n,), B u (2n,) and the last e_a."""
+    for i in range(f_hat.size):
+        rate = f_hat[i] + Bu[i] + observer.gain[i] * observer.e_obs[i]
+        observer.x_hat[i] += observer.dt * rate

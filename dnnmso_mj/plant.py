@@ -6,28 +6,54 @@ torques, and is read by joint angle and velocity.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
-from dnnmso_mj.dynamics import Links, centre_and_inertia
+from dnnmso_mj.compiling import compiled, copy, inner
 from dnnmso_mj.errors import ScenarioError
+from dnnmso_mj.links import set_links
+from dnnmso_mj.mujoco_calls import (
+    mj_comPos,
+    mj_Euler,
+    mj_forward,
+    mj_fullM,
+    mj_fwdPosition,
+    mj_fwdVelocity,
+    mj_implicit,
+    mj_kinematics,
+    mj_makeM,
+    mj_RungeKutta,
+    mj_solveM,
+)
 from dnnmso_mj.scenario import Inertia, Scenario
 from dnnmso_mj.scenario import Plant as PlantSpec
+from dnnmso_mj.unmodelled import refuse_unmodelled
 
 Array = np.ndarray
-
-# MuJoCo refuses a moving body without rotational inertia; this is far below double precision.
-POINT_INERTIA = 1e-14
 
 INTEGRATORS = {
     "rk4": mujoco.mjtIntegrator.mjINT_RK4,
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
+RK4, EULER = int(INTEGRATORS["rk4"]), int(INTEGRATORS["euler"])
+
+LOGGER = logging.getLogger(__name__)
+
+
+def _tell(warning: str) -> None:
+    LOGGER.warning("MuJoCo: %s", warning)
+
+
+# Otherwise MuJoCo leaves a file MUJOCO_LOG.TXT in the current folder. Its C code calls this, so it
+# must never raise.
+mujoco.set_mju_user_warning(_tell)
 
 
 @dataclass(frozen=True)
@@ -70,8 +96,8 @@ def build_spec(plant: PlantSpec, dt: float, mjcf: Mjcf) -> mujoco.MjSpec:
     """Give an MJCF the scenario's masses, lengths, gravity and step.
 
     Raises:
-        ScenarioError: MuJoCo cannot read the file, or it lacks the bodies link1 … linkn that
-            masses and lengths are set on.
+        ScenarioError: MuJoCo cannot read the file, or it is not the chain of bodies link1 … linkn
+            that masses and lengths are set on.
     """
     try:
         spec = mujoco.MjSpec.from_string(mjcf.text)
@@ -88,38 +114,8 @@ def build_spec(plant: PlantSpec, dt: float, mjcf: Mjcf) -> mujoco.MjSpec:
     return spec
 
 
-def set_links(
-    spec: mujoco.MjSpec, links: Links, masses: tuple[float, ...], lengths: tuple[float, ...]
-) -> None:
-    """Give bodies link1 … linkn of a chain along x their masses (kg) and lengths (m)."""
-    for k, (mass, length) in enumerate(zip(masses, lengths, strict=True), start=1):
-        body = spec.body(f"link{k}")
-        if body is None:
-            names = ", ".join(b.name for b in spec.bodies[1:])
-            raise ScenarioError(
-                f"plant.masses has {len(masses)} entries, but the model has no body 'link{k}' "
-                f"(it has: {names}). Allowed: bodies link1 to link{len(masses)}, or null masses "
-                "and lengths to keep what the MJCF says."
-            )
-        centre, inertia = centre_and_inertia(links, mass, length)
-        body.mass = mass
-        body.ipos = [centre, 0.0, 0.0]
-        # A thin rod along x: no inertia about its own axis.
-        body.inertia = [POINT_INERTIA, max(inertia, POINT_INERTIA), max(inertia, POINT_INERTIA)]
-        body.explicitinertial = 1
-        for child in body.bodies:
-            child.pos = [length, 0.0, 0.0]
-        for geom in body.geoms:
-            if geom.type == mujoco.mjtGeom.mjGEOM_CAPSULE:
-                geom.fromto = [0.0, 0.0, 0.0, length, 0.0, 0.0]
-            else:
-                geom.pos = [length, 0.0, 0.0]
-        for site in body.sites:
-            site.pos = [length, 0.0, 0.0]
-
-
 def compile_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
-    """Compile, and refuse what the testbed cannot drive: other joints, other actuators.
+    """Compile, and refuse what the testbed cannot drive: other joints, actuators and forces.
 
     Raises:
         ScenarioError: naming the model and what it has too much or too little of.
@@ -136,6 +132,7 @@ def compile_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
         )
     direct = (
         model.nu == model.nv
+        and np.all(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
         and np.array_equal(model.actuator_trnid[:, 0], np.arange(model.nv))
         and np.all(model.actuator_gear[:, 0] == 1.0)
         and np.all(model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
@@ -149,7 +146,20 @@ def compile_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
             '<motor gear="1"> a joint, in the order of the joints, without ctrlrange (torque '
             "limits belong to the scenario)"
         )
+    refuse_unmodelled(model, name)
     return model
+
+
+class PlantView(NamedTuple):
+    """The simulated robot as compiled code sees it, by address; keep its `Plant` alive."""
+
+    model: int  # addresses
+    data: int
+    integrator: int
+    q: Array  # (n,) rad
+    qd: Array  # (n,) rad/s
+    ctrl: Array  # (n,) N·m
+    qacc: Array  # (n,) rad/s²
 
 
 class Plant:
@@ -162,6 +172,7 @@ class Plant:
     Attributes:
         q, qd: joint angle (n,) rad and velocity (n,) rad/s: live, read-only views.
         model: MuJoCo's model.
+        view: the same robot for compiled code.
     """
 
     def __init__(self, scenario: Scenario, mjcf: Mjcf) -> None:
@@ -172,11 +183,18 @@ class Plant:
                 f"initial.q has {scenario.n_joints} entries; allowed: {self.model.nv}, "
                 f"since plant.model = {scenario.plant.model} has {self.model.nv} joints"
             )
-        self._data = mujoco.MjData(self.model)
-        self.q: Array = _read_only(self._data.qpos)
-        self.qd: Array = _read_only(self._data.qvel)
-        self._ctrl: Array = self._data.ctrl
-        self._qacc: Array = self._data.qacc
+        data = self._data = mujoco.MjData(self.model)
+        self.q: Array = _read_only(data.qpos)
+        self.qd: Array = _read_only(data.qvel)
+        self.view = PlantView(
+            model=self.model._address,
+            data=data._address,
+            integrator=int(self.model.opt.integrator),
+            q=data.qpos,
+            qd=data.qvel,
+            ctrl=data.ctrl,
+            qacc=data.qacc,
+        )
 
     def reset(self, q: Array, qd: Array) -> None:
         """Put the robot at q (n,) rad, q̇ (n,) rad/s, at time zero."""
@@ -186,14 +204,48 @@ class Plant:
 
     def acceleration(self, tau: Array) -> Array:
         """True q̈ (n,) rad/s² at the present state under τ (n,) N·m: a live view."""
-        self._ctrl[:] = tau
-        mujoco.mj_forward(self.model, self._data)
-        return self._qacc
+        forward(self.view, tau)
+        return self.view.qacc
 
     def step(self, tau: Array) -> None:
         """Hold τ (n,) N·m for one step dt."""
-        self._ctrl[:] = tau
-        mujoco.mj_step(self.model, self._data)
+        forward(self.view, tau)
+        integrate(self.view)
+
+
+@inner
+def forward(plant: PlantView, tau: Array) -> None:
+    """True q̈ at the present state under τ (n,) N·m, into `qacc`."""
+    copy(tau, plant.ctrl)
+    mj_forward(plant.model, plant.data)
+
+
+@inner
+def integrate(plant: PlantView) -> None:
+    """Hold for one step the torque of the last `forward`: with it, what mj_step does."""
+    if plant.integrator == RK4:
+        mj_RungeKutta(plant.model, plant.data, 4)
+    elif plant.integrator == EULER:
+        mj_Euler(plant.model, plant.data)
+    else:
+        mj_implicit(plant.model, plant.data)
+
+
+@inner
+def solve_inertia(plant: PlantView, tau: Array, out: Array) -> None:
+    """out = M(q)⁻¹ τ (n,) of the plant, at the state of the last `forward`."""
+    mj_solveM(plant.model, plant.data, out.ctypes.data, tau.ctypes.data, 1)
+
+
+class Nominal(NamedTuple):
+    """A nominal model as compiled code sees it, by address; keep its `NominalModel` alive."""
+
+    model: int  # addresses
+    data: int
+    q: Array  # (n,) rad
+    qd: Array  # (n,) rad/s
+    M: Array  # (n, n) kg·m², of the last `inertia`
+    bias: Array  # (n,) N·m, of the last `bias`
 
 
 class NominalModel:
@@ -202,6 +254,9 @@ class NominalModel:
     Args:
         scenario: for the nominal masses and lengths, which may be set wrong.
         mjcf: the model that it names.
+
+    Attributes:
+        view: the same model for compiled code.
     """
 
     def __init__(self, scenario: Scenario, mjcf: Mjcf) -> None:
@@ -216,28 +271,52 @@ class NominalModel:
                     "or none, where plant.masses and plant.lengths are null"
                 )
             if masses is not None and lengths is not None:
-                set_links(spec, scenario.plant.links, masses, lengths)
+                set_links(
+                    spec,
+                    scenario.plant.links,
+                    masses,
+                    lengths,
+                    part="controller.inversion.effectiveness",
+                )
         self.model = compile_spec(spec, scenario.plant.model)
-        self._data = mujoco.MjData(self.model)
-        self._M: Array = np.zeros((self.model.nv, self.model.nv))
-        self._qfrc_bias: Array = self._data.qfrc_bias
+        data = mujoco.MjData(self.model)
+        self.view = Nominal(
+            model=self.model._address,
+            data=data._address,
+            q=data.qpos,
+            qd=data.qvel,
+            M=np.zeros((self.model.nv, self.model.nv)),
+            bias=data.qfrc_bias,
+        )
 
     def inertia(self, q: Array) -> Array:
         """Nominal M(q) (n, n) kg·m²; overwritten by the next call."""
-        self._data.qpos[:] = q
-        mujoco.mj_kinematics(self.model, self._data)
-        mujoco.mj_comPos(self.model, self._data)
-        mujoco.mj_makeM(self.model, self._data)
-        mujoco.mj_fullM(self.model, self._data, self._M)
-        return self._M
+        inertia(self.view, q)
+        return self.view.M
 
     def bias(self, q: Array, qd: Array) -> Array:
         """Nominal V(q, q̇) + G(q) (n,) N·m; overwritten by the next call."""
-        self._data.qpos[:] = q
-        self._data.qvel[:] = qd
-        mujoco.mj_fwdPosition(self.model, self._data)
-        mujoco.mj_fwdVelocity(self.model, self._data)
-        return self._qfrc_bias
+        bias(self.view, q, qd)
+        return self.view.bias
+
+
+@inner
+def inertia(nominal: Nominal, q: Array) -> None:
+    """M(q) into `nominal.M`."""
+    copy(q, nominal.q)
+    mj_kinematics(nominal.model, nominal.data)
+    mj_comPos(nominal.model, nominal.data)
+    mj_makeM(nominal.model, nominal.data)
+    mj_fullM(nominal.model, nominal.data, nominal.M.ctypes.data)
+
+
+@compiled
+def bias(nominal: Nominal, q: Array, qd: Array) -> None:
+    """V(q, q̇) + G(q) into `nominal.bias`."""
+    copy(q, nominal.q)
+    copy(qd, nominal.qd)
+    mj_fwdPosition(nominal.model, nominal.data)
+    mj_fwdVelocity(nominal.model, nominal.data)
 
 
 def _read_only(array: Array) -> Array:

@@ -1,43 +1,61 @@
-"""The one loop: sense, command, learn, record, act, step.
+"""The one loop: sense, command, learn, record, act, step; see `tick` for what one tick is.
 
-Tick k at t_k = k·dt: read the sensors and the reference, update the controller, record, pass the
-command through the actuators, hold the torque for one step. No hidden delay; time is computed,
-never accumulated.
+Ticks run in blocks. A controller with compiled ticks runs a block without the interpreter; any
+other has its `update` called tick by tick between the same two compiled halves.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
+from numba.core import event
 
-from dnnmso_mj.controllers import Command, build_controller
+from dnnmso_mj.compiling import CompileNotice
+from dnnmso_mj.controllers import Controller, build_controller, compiled_ticks
 from dnnmso_mj.errors import NonFiniteError
-from dnnmso_mj.imperfections import Actuators
-from dnnmso_mj.plant import Mjcf, Plant
+from dnnmso_mj.imperfections import build_actuators
+from dnnmso_mj.plant import RK4, Mjcf, Plant
 from dnnmso_mj.reference import Reference
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.theory import TrackingBounds
+from dnnmso_mj.theory import build_bounds, start_bounds
+from dnnmso_mj.tick import (
+    CHUNK_START,
+    DIVERGED_ABOVE,
+    MUJOCO_ZEROES_ABOVE,
+    N_COUNTS,
+    OUT_OF_RANGE,
+    ROWS,
+    RUNNING,
+    START_NS,
+    STATUS,
+    TAU_NOT_FINITE,
+    TAU_TOO_LARGE,
+    TOOK_NS,
+    Pace,
+    World,
+    begin_tick,
+    end_tick,
+)
 from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
 
 Array = np.ndarray
 Progress = Callable[[int], None]
 
-# rad, rad/s: no arm is there and comes back.
-DIVERGED_ABOVE = 1e3
-MUJOCO_ZEROES_ABOVE = 1e9  # N·m; from 1e10 on MuJoCo drops a torque with a mere warning
-BLOCK = 1024  # ticks between two looks at the reference, progress and interrupts
+HEAD_START_NS = 20_000_000  # from a paced run's beginning to its first tick
+BLOCK = 50  # ticks between two looks at the recorder, progress and interrupts
+CHUNK = 1000  # ticks of the reference sampled at once
 SNAPSHOT_PERIOD = 1.0  # s
+AS_FAST_AS_CAN_BE = Pace(0, 0, 0.0, np.zeros((0, 2), np.int64))
 
 
 class Recorder(Protocol):
     """Where the rows of a run go."""
 
-    def append(self, row: Array) -> None:
-        """Take one tick: a row of `StepLayout.width` doubles, copied."""
+    def append(self, rows: Array) -> None:
+        """Take some ticks: rows (m, `StepLayout.width`), which are overwritten afterwards."""
 
     def event(self, event: Event) -> None:
         """Take an event."""
@@ -46,42 +64,66 @@ class Recorder(Protocol):
         """Take the controller's whole state at time t."""
 
 
-class Row:
-    """One tick's numbers in one array, with a named view for each field."""
-
-    def __init__(self, layout: StepLayout) -> None:
-        self.data = np.zeros(layout.width)
-        self._views = {name: self.data[where] for name, where in layout.slices.items()}
-
-    def __getitem__(self, name: str) -> Array:
-        return self._views[name]
-
-
 class Simulation:
     """A scenario made ready to run: plant, reference, controller and actuators.
 
     Args:
         scenario: the experiment.
         mjcf: the model that it names.
+        watch: whether the network's monitors are kept; without them all other columns are the same.
+        pace: how ticks follow the wall clock; by default they do not.
+        controller: by default the one that the scenario names.
 
     Raises:
         ScenarioError: the model cannot be used, or does not fit the scenario.
     """
 
-    def __init__(self, scenario: Scenario, mjcf: Mjcf) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        mjcf: Mjcf,
+        *,
+        watch: bool = True,
+        pace: Pace = AS_FAST_AS_CAN_BE,
+        controller: Controller | None = None,
+    ) -> None:
         n = scenario.n_joints
         self.scenario = scenario
         self.plant = Plant(scenario, mjcf)
         self.reference = Reference(scenario.reference, n)
-        self.controller = build_controller(scenario, mjcf)
-        self.actuators = Actuators(scenario.imperfections, n)
+        self.controller = controller or build_controller(scenario, mjcf, watch=watch)
         self.layout = StepLayout(n, self.controller.n_layers)
-        self._row = Row(self.layout)
-        self._tau = np.zeros(n)
-        self._e_track = np.zeros(2 * n)
-        self._x, self._x_ref, self._xd_ref = np.zeros(2 * n), np.zeros(2 * n), np.zeros(2 * n)
-        self._f_true = self._row["f_true"]
-        self._f_err = np.zeros(2 * n)
+        bounds = build_bounds(
+            scenario.controller.inversion,
+            n,
+            scenario.dt,
+            first_order=self.plant.view.integrator != RK4,
+        )
+        q_ref, qd_ref, qdd_ref = np.zeros((3, CHUNK, n))
+        x, x_ref, xd_ref, e_track, f_true, f_err = np.zeros((6, 2 * n))
+        self.world = World(
+            plant=self.plant.view,
+            actuators=build_actuators(scenario.imperfections, n),
+            bounds=bounds,
+            pace=pace,
+            q_ref=q_ref,
+            qd_ref=qd_ref,
+            qdd_ref=qdd_ref,
+            x=x,
+            x_ref=x_ref,
+            xd_ref=xd_ref,
+            e_track=e_track,
+            f_true=f_true,
+            f_err=f_err,
+            tau=np.zeros(n),
+            qdd=np.zeros(n),
+            L=np.zeros((n, n)),
+            rows=np.zeros((BLOCK, self.layout.width)),
+            counts=np.zeros(N_COUNTS, np.int64),
+            late_ns=np.zeros(1, np.int64),
+            timespec=np.zeros(2, np.int64),
+            dt=scenario.dt,
+        )
         self._was_saturated = False
 
     def run(self, recorder: Recorder, progress: Progress | None = None) -> RunInfo:
@@ -89,125 +131,137 @@ class Simulation:
 
         Args:
             recorder: takes rows, events and snapshots.
-            progress: called now and then with the number of ticks done.
+            progress: called now and then with the number of ticks done since.
 
         Returns:
             Status "ok" or "diverged" (with the reason), the seed and the wall time of the loop.
         """
-        started = time.perf_counter()
         status, reason = "ok", ""
+        self._tick = 0
+        self._ticks = compiled_ticks(self.controller)
+        self._prepare()
+        started = time.perf_counter()
         try:
             self._loop(recorder, progress)
         except NonFiniteError as error:
-            t = float(self._row["t"][0])
-            status, reason = "diverged", f"{error} at t = {t:.6g} s"
+            t = self._tick * self.scenario.dt
+            state = self.controller.state()
+            causes = [name for name, values in state.items() if not np.isfinite(values).all()]
+            cause = f" with {', '.join(causes)} not finite" if causes else ""
+            status, reason = "diverged", f"{error}{cause} at t = {t:.6g} s"
             recorder.event(Event(t, "error", f"diverged: {reason}"))
+            recorder.snapshot("controller", t, state)
         wall = time.perf_counter() - started
         return RunInfo(status=status, seed=self.scenario.seed, wall_s=wall, reason=reason)
 
-    def _loop(self, recorder: Recorder, progress: Progress | None) -> None:
-        scenario, n = self.scenario, self.scenario.n_joints
+    def _prepare(self) -> None:
+        """Load or compile what ticks need, so that none of them pays for it; go to the start."""
+        with event.install_listener("numba:compile", CompileNotice()):
+            if self._ticks is not None:
+                self._ticks.run(self.world, self._ticks.parts, 0, 0)
+            elif self.world.pace.period_ns:
+                state = self.controller.state()
+                self._start()
+                self._run_interpreted(0, 1)
+                self.controller.restore(state)
         self._start()
-        n_ticks, dt = scenario.n_ticks, scenario.dt
-        snapshot_every = max(1, round(SNAPSHOT_PERIOD / dt))
-        for first in range(0, n_ticks, BLOCK):
-            ticks = np.arange(first, min(first + BLOCK, n_ticks))
-            q_ref, qd_ref, qdd_ref = self.reference.sample(ticks * dt)
-            for i, k in enumerate(ticks.tolist()):
-                if k % snapshot_every == 0:
-                    recorder.snapshot("controller", k * dt, self.controller.state())
-                self._x_ref[:n], self._x_ref[n:] = q_ref[i], qd_ref[i]
-                self._xd_ref[:n], self._xd_ref[n:] = qd_ref[i], qdd_ref[i]
-                self._tick(k, recorder)
-            if progress is not None:
-                progress(len(ticks))
-        recorder.snapshot("controller", n_ticks * dt, self.controller.state())
 
     def _start(self) -> None:
-        scenario, n = self.scenario, self.scenario.n_joints
-        x = self._x
-        x[:n] = scenario.initial.q
-        x[n:] = scenario.initial.qd
+        scenario, world, n = self.scenario, self.world, self.scenario.n_joints
+        x = np.zeros(2 * n)
+        x[:n], x[n:] = scenario.initial.q, scenario.initial.qd
         self.plant.reset(x[:n], x[n:])
         self.controller.reset(x)
         q_ref, qd_ref, _ = self.reference.sample(np.zeros(1))
-        e_track = x - np.concatenate([q_ref[0], qd_ref[0]])
-        inversion = scenario.controller.inversion
-        self._bounds = TrackingBounds(inversion, n, scenario.dt, e_track)
+        start_bounds(world.bounds, x - np.concatenate([q_ref[0], qd_ref[0]]))
+        world.tau[:] = 0.0
+        world.counts[:] = 0
+        self._sample_reference(0)
+        self._was_saturated = False
 
-    def _tick(self, k: int, recorder: Recorder) -> None:
-        n, row = self.scenario.n_joints, self._row
-        t = k * self.scenario.dt
-        self._x[:n], self._x[n:] = self.plant.q, self.plant.qd
-        np.subtract(self._x, self._x_ref, out=self._e_track)
-        if k > 0:
-            qdd = self.plant.acceleration(self._tau)
-            self._bounds.end(self._e_track, qdd - self._xd_ref[n:])
-        row["t"][0] = t
-        began = time.perf_counter_ns()
-        command = self.controller.update(self._x, self._x_ref, self._xd_ref)
-        row["compute_us"][0] = (time.perf_counter_ns() - began) * 1e-3
-        tau = self.actuators.apply(command.tau)
-        if not math.isfinite(tau.sum()):
-            raise NonFiniteError("tau", command.tau.tolist())
-        if np.abs(tau).max() > MUJOCO_ZEROES_ABOVE:
-            raise NonFiniteError("tau", f"{tau.tolist()}, above {MUJOCO_ZEROES_ABOVE:g}")
-        self._true_dynamics(command, tau)
-        self._fill(command, tau)
-        self._check_finite(row)
-        recorder.append(row.data)
-        self._check_range(row)
-        self._watch_saturation(t, recorder)
-        self._bounds.begin(self._f_err)
-        self._tau[:] = tau
-        self.plant.step(tau)
+    def _loop(self, recorder: Recorder, progress: Progress | None) -> None:
+        n_ticks, dt = self.scenario.n_ticks, self.scenario.dt
+        snapshot_every = max(1, round(SNAPSHOT_PERIOD / dt))
+        self.world.counts[START_NS] = time.monotonic_ns() + HEAD_START_NS
+        while self._tick < n_ticks:
+            first = self._tick
+            if first % snapshot_every == 0:
+                recorder.snapshot("controller", first * dt, self.controller.state())
+            if first % CHUNK == 0 and first > 0:
+                self._sample_reference(first)
+            ends = [first + BLOCK, n_ticks]
+            ends += [(first // every + 1) * every for every in (CHUNK, snapshot_every)]
+            count = min(ends) - first
+            self._run_block(first, count, recorder)
+            if progress is not None:
+                progress(count)
+        recorder.snapshot("controller", n_ticks * dt, self.controller.state())
 
-    def _true_dynamics(self, command: Command, tau: Array) -> None:
-        """f_true = Ẋ − B τ, and what the closed loop feels of it, Ẋ − B τ_cmd − f̂."""
-        n, f_true = self.scenario.n_joints, self._f_true
-        f_true[:n] = self._x[n:]
-        f_true[n:] = self.plant.acceleration(tau)
-        np.subtract(f_true, command.Bu, out=self._f_err)
-        self._f_err -= command.f_hat
-        f_true -= self.controller.effect(tau) if self.actuators.saturated else command.Bu
+    def _sample_reference(self, first: int) -> None:
+        world = self.world
+        world.counts[CHUNK_START] = first
+        t = np.arange(first, first + CHUNK) * self.scenario.dt
+        world.q_ref[:], world.qd_ref[:], world.qdd_ref[:] = self.reference.sample(t)
 
-    def _fill(self, command: Command, tau: Array) -> None:
-        n, row, monitors = self.scenario.n_joints, self._row, command.monitors
-        row["q"][:], row["qd"][:] = self._x[:n], self._x[n:]
-        row["q_meas"][:], row["qd_meas"][:] = self._x[:n], self._x[n:]
-        row["q_ref"][:], row["qd_ref"][:] = self._x_ref[:n], self._x_ref[n:]
-        row["tau_cmd"][:], row["tau"][:] = command.tau, tau
-        row["x_hat"][:], row["f_hat"][:] = command.x_hat, command.f_hat
-        row["e_obs"][:] = command.e_obs
-        row["weight_norm"][:] = monitors.weight_norm
-        row["update_ratio"][:] = monitors.update_ratio
-        row["eta_bound"][:] = monitors.eta_bound
-        row["gradient_change"][:] = monitors.gradient_change
-        row["drt_bound"][0] = monitors.drt_bound
-        e_track = self._e_track
-        row["lyapunov"][0] = e_track.dot(e_track)
-        row["ultimate_bound"][0] = self._bounds.joint
-        row["ultimate_bound_paper"][0] = self._bounds.paper
-        row["saturated"][0] = self.actuators.saturated
-        row["clipped"][0] = monitors.clipped
+    def _run_block(self, first: int, count: int, recorder: Recorder) -> None:
+        """Ticks first to first + count, and their rows to the recorder.
 
-    def _check_finite(self, row: Row) -> None:
-        if not np.isfinite(row.data).all():
-            name = next(f for f in self.layout.widths if not np.isfinite(row[f]).all())
-            raise NonFiniteError(name, row[name].tolist())
+        Raises:
+            NonFiniteError: the run must end; rows before it are recorded.
+        """
+        counts = self.world.counts
+        counts[ROWS], counts[STATUS] = 0, RUNNING
+        try:
+            if self._ticks is not None:
+                self._ticks.run(self.world, self._ticks.parts, first, count)
+            else:
+                self._run_interpreted(first, count)
+        finally:
+            self._tick = first + int(counts[ROWS])
+            rows = self.world.rows[: counts[ROWS]]
+            if len(rows):
+                recorder.append(rows)
+                self._watch_saturation(rows, recorder)
+        if counts[STATUS] != RUNNING:
+            raise self._why_it_ended()
 
-    def _check_range(self, row: Row) -> None:
-        """Stop where the state has left this world, long before numbers overflow."""
-        for name in ("q", "qd", "x_hat"):
-            largest = float(np.abs(row[name]).max())
-            if largest > DIVERGED_ABOVE:
-                raise NonFiniteError(f"|{name}|", f"{largest:.4g}, above {DIVERGED_ABOVE:g}")
+    def _run_interpreted(self, first: int, count: int) -> None:
+        world = self.world
+        for k in range(first, first + count):
+            if begin_tick(world, k):
+                began = time.perf_counter_ns()
+                self._command = self.controller.update(world.x, world.x_ref, world.xd_ref)
+                world.counts[TOOK_NS] = time.perf_counter_ns() - began
+            if end_tick(world, self._command, k):
+                return
 
-    def _watch_saturation(self, t: float, recorder: Recorder) -> None:
-        if self.actuators.saturated != self._was_saturated:
-            self._was_saturated = self.actuators.saturated
-            what = "torque limit reached" if self._was_saturated else "torque limit left"
-            recorder.event(Event(t, "warning" if self._was_saturated else "info", what))
+    def _why_it_ended(self) -> NonFiniteError:
+        """The quantity that a tick found wrong, and its value."""
+        counts, world = self.world.counts, self.world
+        tau = world.actuators.tau.tolist()
+        if counts[STATUS] == TAU_NOT_FINITE:
+            return NonFiniteError("tau", tau)
+        if counts[STATUS] == TAU_TOO_LARGE:
+            return NonFiniteError("tau", f"{tau}, above {MUJOCO_ZEROES_ABOVE:g}")
+        out_of_range = counts[STATUS] == OUT_OF_RANGE
+        self._tick -= 1 if out_of_range else 0  # such a row is recorded
+        row = world.rows[counts[ROWS] - (1 if out_of_range else 0)]
+        fields = {name: row[where] for name, where in self.layout.slices.items()}
+        if out_of_range:
+            largest = {name: float(np.abs(fields[name]).max()) for name in ("q", "qd", "x_hat")}
+            name = next(name for name, value in largest.items() if value > DIVERGED_ABOVE)
+            return NonFiniteError(f"|{name}|", f"{largest[name]:.4g}, above {DIVERGED_ABOVE:g}")
+        name = next(name for name, values in fields.items() if not np.isfinite(values).all())
+        return NonFiniteError(name, fields[name].tolist())
+
+    def _watch_saturation(self, rows: Array, recorder: Recorder) -> None:
+        """An event where the torque limit begins to act, and one where it ceases."""
+        t, saturated = rows[:, 0], rows[:, self.layout.slices["saturated"]][:, 0] != 0.0
+        before = np.concatenate([[self._was_saturated], saturated[:-1]])
+        self._was_saturated = bool(saturated[-1])
+        for i in np.flatnonzero(saturated != before):
+            level, what = ("warning", "reached") if saturated[i] else ("info", "left")
+            recorder.event(Event(float(t[i]), level, f"torque limit {what}"))
 
 
 class MemoryRecorder:
@@ -224,9 +278,9 @@ class MemoryRecorder:
         self._count = 0
         self._events: list[Event] = []
 
-    def append(self, row: Array) -> None:
-        self._rows[self._count] = row
-        self._count += 1
+    def append(self, rows: Array) -> None:
+        self._rows[self._count : self._count + len(rows)] = rows
+        self._count += len(rows)
 
     def event(self, event: Event) -> None:
         self._events.append(event)
@@ -240,18 +294,19 @@ class MemoryRecorder:
         return Trace(columns, scenario, info, tuple(self._events))
 
 
-def simulate(scenario: Scenario, mjcf: Mjcf | None = None) -> Trace:
+def simulate(scenario: Scenario, mjcf: Mjcf | None = None, *, watch: bool = True) -> Trace:
     """Run a scenario in memory.
 
     Args:
         scenario: the experiment.
         mjcf: its model; by default the one that `scenario.plant.model` names.
+        watch: whether the network's monitors are kept, for 2 µs a tick.
     """
     if mjcf is None:
         from dnnmso_mj.paths import find_model
 
         mjcf = Mjcf.read(find_model(scenario.plant.model))
-    simulation = Simulation(scenario, mjcf)
+    simulation = Simulation(scenario, mjcf, watch=watch)
     recorder = MemoryRecorder(simulation.layout, scenario.n_ticks)
     info = simulation.run(recorder)
     return recorder.trace(scenario, info)

@@ -13,18 +13,20 @@ with them. If ‖d‖ ≤ ε after some time, then ultimately ‖s‖ ≤ ε/K a
 `TrackingBounds` integrates these comparison equations with the true ‖d(t)‖: that holds during the
 transient too, and settles at the ultimate bound when ‖d‖ does. The paper's own bound,
 ‖e_r‖ ≤ ε/λ_min(K) with ‖f̃‖ ≤ ε, is integrated likewise; it presumes an inversion of all 2n rows,
-which slack variables do not give. Both are bounds of the continuous arm: RK4 keeps to them, while
-MuJoCo's Euler adds up to dt/2·Δė of its own to e, which can exceed a very small bound.
+which slack variables do not give. Both are bounds of the continuous arm. RK4 keeps to it; Euler and
+implicitfast slip from it each period by ½dt²·q̈ in q and ½dt·Δq̈ in q̇, which the joint bound adds.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
+from dnnmso_mj.compiling import compiled, copy, inner
 from dnnmso_mj.inversion import slack_coupling, slack_matrix
-from dnnmso_mj.kernel import CLIPPED, DW_SQ, G_SQ, GW, W_SQ, compiled
+from dnnmso_mj.kernel import CLIPPED, DW_SQ, G_SQ, GW, W_SQ
 from dnnmso_mj.scenario import Inversion as InversionSpec
 from dnnmso_mj.scenario import expand
 
@@ -64,62 +66,93 @@ def layer_monitors(
     return product - 1.0, clipped
 
 
-class TrackingBounds:
+class TrackingBounds(NamedTuple):
     """Live bounds on the tracking error, driven by the true f̃.
 
     For each control period: `begin` with what acts when the torque is set, `end` with what has
     become of it just before the next torque.
-
-    Args:
-        spec: K and the slack matrix of the inversion.
-        n_joints: n.
-        dt: control period (s).
-        e_track: initial e_r = X − X_d (2n,).
-
-    Attributes:
-        joint: bound on every |q_i − q_ref,i| (rad), or -1 where K or Λ is not scalar.
-        paper: the paper's bound on ‖e_r‖.
     """
 
-    def __init__(self, spec: InversionSpec, n_joints: int, dt: float, e_track: Array) -> None:
-        n = n_joints
-        K, coupling = expand(spec.K, 2 * n), slack_coupling(slack_matrix(spec, n))
-        self._K, self._lam = float(K[0]), float(coupling[0, 0])
-        self._scalar = bool(np.ptp(K) == 0 and np.array_equal(coupling, self._lam * np.eye(n)))
-        self._n = n
-        self._s_decay, self._s_gain = _hold(self._K, dt)
-        self._e_decay, self._e_gain = _hold(self._lam, dt)
-        self._x_decay, self._x_gain = _hold(float(K.min()), dt)
-        self._d_norm = self._f_err_norm = 0.0
-        e, ed = e_track[:n], e_track[n:]
-        self._s = float(np.linalg.norm(ed + self._lam * e))
-        self.joint = float(np.linalg.norm(e)) if self._scalar else UNDEFINED
-        self.paper = float(np.linalg.norm(e_track))
+    joint: Array  # (1,) bound on every |q_i − q_ref,i| (rad), or −1 where K or Λ is not scalar
+    paper: Array  # (1,) the paper's bound on ‖e_r‖
+    s: Array  # (1,) bound on ‖ė + λe‖
+    norms: Array  # (2,) ‖d‖ and ‖f̃‖ at the period's begin
+    qdd: Array  # (n,) rad/s² at the period's begin
+    gains: Array  # (2,) K and λ
+    holds: Array  # (3, 2) decay and gain of s, e and the paper's bound over a period
+    dt: float
+    first_order: bool  # whether the integrator errs by more than terms of dt³
 
-    def begin(self, f_err: Array) -> None:
-        """A period begins in which f̃ (2n,) acts, torque saturation included."""
-        d = self._lam * f_err[: self._n]
-        d += f_err[self._n :]
-        self._d_norm = math.sqrt(d.dot(d))
-        self._f_err_norm = math.sqrt(f_err.dot(f_err))
 
-    def end(self, e_track: Array, edd: Array) -> None:
-        """The period ends at e_r (2n,), with ë (n,) rad/s² under the torque that was held.
+def build_bounds(
+    spec: InversionSpec, n_joints: int, dt: float, *, first_order: bool
+) -> TrackingBounds:
+    """Bounds for the inversion's K and slack matrix; `start_bounds` comes next."""
+    n = n_joints
+    K, coupling = expand(spec.K, 2 * n), slack_coupling(slack_matrix(spec, n))
+    gain, lam = float(K[0]), float(coupling[0, 0])
+    scalar = bool(np.ptp(K) == 0 and np.array_equal(coupling, lam * np.eye(n)))
+    return TrackingBounds(
+        joint=np.full(1, 0.0 if scalar else UNDEFINED),
+        paper=np.zeros(1),
+        s=np.zeros(1),
+        norms=np.zeros(2),
+        qdd=np.zeros(n),
+        gains=np.array([gain, lam]),
+        holds=np.array([_hold(gain, dt), _hold(lam, dt), _hold(float(K.min()), dt)]),
+        dt=dt,
+        first_order=first_order,
+    )
 
-        There d = ë + (K + λ) ė + Kλ e, by the definition of s alone; ‖d‖ in between is at most the
-        mean of both ends, but for terms of order dt².
-        """
-        self.paper = self._x_decay * self.paper + self._x_gain * self._f_err_norm
-        if not self._scalar:
-            return
-        n, K, lam = self._n, self._K, self._lam
-        d = (K + lam) * e_track[n:]
-        d += edd
-        d += (K * lam) * e_track[:n]
-        mean = 0.5 * (self._d_norm + math.sqrt(d.dot(d)))
-        s = self._s_decay * self._s + self._s_gain * mean
-        self.joint = self._e_decay * self.joint + self._e_gain * max(s, self._s)
-        self._s = s
+
+def start_bounds(bounds: TrackingBounds, e_track: Array) -> None:
+    """Start at the tracking error e_r (2n,)."""
+    n, lam = e_track.size // 2, bounds.gains[1]
+    if bounds.joint[0] != UNDEFINED:
+        bounds.joint[0] = np.linalg.norm(e_track[:n])
+    bounds.s[0] = np.linalg.norm(e_track[n:] + lam * e_track[:n])
+    bounds.paper[0] = np.linalg.norm(e_track)
+
+
+@inner
+def begin_period(bounds: TrackingBounds, f_err: Array, qdd: Array) -> None:
+    """A period begins in which f̃ (2n,) acts, torque saturation included, and the arm has q̈ (n,)."""
+    n, lam = qdd.size, bounds.gains[1]
+    d_sq = f_sq = 0.0
+    for i in range(n):
+        d_sq += (lam * f_err[i] + f_err[n + i]) ** 2
+        f_sq += f_err[i] ** 2 + f_err[n + i] ** 2
+    bounds.norms[0], bounds.norms[1] = math.sqrt(d_sq), math.sqrt(f_sq)
+    copy(qdd, bounds.qdd)
+
+
+@inner
+def end_period(bounds: TrackingBounds, e_track: Array, qdd: Array, qdd_ref: Array) -> None:
+    """The period ends at e_r (2n,), with q̈ (n,) rad/s² under the torque that was held.
+
+    There d = ë + (K + λ) ė + Kλ e, by the definition of s alone; ‖d‖ in between is at most the mean
+    of both ends, but for terms of order dt².
+    """
+    bounds.paper[0] = bounds.holds[2, 0] * bounds.paper[0] + bounds.holds[2, 1] * bounds.norms[1]
+    if bounds.joint[0] == UNDEFINED:
+        return
+    n, dt = qdd.size, bounds.dt
+    K, lam = bounds.gains
+    d_sq = q_slip_sq = v_slip_sq = 0.0
+    for i in range(n):
+        edd = qdd[i] - qdd_ref[i]
+        d_sq += (edd + (K + lam) * e_track[n + i] + K * lam * e_track[i]) ** 2
+        q_slip_sq += (0.5 * dt * dt * bounds.qdd[i]) ** 2
+        v_slip_sq += (0.5 * dt * (qdd[i] - bounds.qdd[i])) ** 2
+    s_before = bounds.s[0]
+    s = bounds.holds[0, 0] * s_before
+    s += bounds.holds[0, 1] * 0.5 * (bounds.norms[0] + math.sqrt(d_sq))
+    joint = bounds.holds[1, 0] * bounds.joint[0]
+    if bounds.first_order:
+        s += math.sqrt(v_slip_sq) + lam * math.sqrt(q_slip_sq)
+        joint += math.sqrt(q_slip_sq)
+    bounds.s[0] = s
+    bounds.joint[0] = joint + bounds.holds[1, 1] * max(s, s_before)
 
 
 def _hold(pole: float, dt: float) -> tuple[float, float]:

@@ -12,7 +12,15 @@ from dnnmso_mj.scenario import Scenario
 Array = np.ndarray
 
 FLAGS = ("saturated", "clipped", "deadline_missed")
-SCALARS = ("t", "drt_bound", "lyapunov", "ultimate_bound", "ultimate_bound_paper", "compute_us")
+SCALARS = (
+    "t",
+    "drt_bound",
+    "lyapunov",
+    "ultimate_bound",
+    "ultimate_bound_paper",
+    "compute_us",
+    "wake_late_us",
+)
 
 
 @dataclass(frozen=True)
@@ -57,6 +65,7 @@ class StepLayout:
             "saturated": 1,  # flags, 0 or 1
             "clipped": 1,
             "deadline_missed": 1,
+            "wake_late_us": 1,  # µs, how late the tick began by the wall clock; 0 where not paced
         }
 
     @property

@@ -23,9 +23,9 @@ from rich.progress import track
 from ruamel.yaml import YAML
 
 from dnnmso_mj.controllers.dnn_mso import DnnMsoController
-from dnnmso_mj.learner import GRADIENT_CHANGE_EVERY
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.metrics import BOUND_MARGIN, BOUND_ROUNDING, compute_metrics
+from dnnmso_mj.monitors import WATCH_EVERY
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import NoNetwork
@@ -127,7 +127,7 @@ def learning_measures(trace: Trace) -> Measures:
     """Deep relative trust and Theorem 1's condition, over the ticks that had a gradient."""
     eta = trace.scenario.controller.madam.eta  # type: ignore[union-attr]
     learned = np.flatnonzero(trace["drt_bound"] > 0)
-    fresh = learned[learned % GRADIENT_CHANGE_EVERY == 0]  # held in between
+    fresh = learned[learned % WATCH_EVERY == 0]  # held in between
     turn = trace["gradient_change"][fresh].max(axis=1) / trace["drt_bound"][fresh]
     bound = trace["eta_bound"][learned].min(axis=1)
     update = trace["update_ratio"][learned].max(axis=1)

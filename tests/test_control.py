@@ -9,15 +9,23 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dnnmso_mj import kernel
 from dnnmso_mj.dynamics import TwoLink
-from dnnmso_mj.inversion import DynamicInversion, invert_augmented, slack_coupling, slack_matrix
-from dnnmso_mj.learner import build_learner, gradient_change
+from dnnmso_mj.inversion import (
+    build_inversion,
+    invert,
+    invert_augmented,
+    slack_coupling,
+    slack_matrix,
+    solve_spd,
+)
+from dnnmso_mj.learner import build_learner
 from dnnmso_mj.network import Shape, TorchNetwork, initial_weights, network_shape
-from dnnmso_mj.observer import StateObserver
+from dnnmso_mj.observer import advance, build_observer, compare, start
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.scenario import Inversion, Madam, Network, Observer
-from dnnmso_mj.theory import UNDEFINED, TrackingBounds
+from dnnmso_mj.theory import UNDEFINED, begin_period, build_bounds, end_period, start_bounds
+from dnnmso_mj.torch_learner import gradient_change
+from tests.kernel_loss import loss_and_gradient
 
 ARM = TwoLink((1.0, 2.3), (1.0, 1.0))
 
@@ -33,33 +41,34 @@ def vectors(n: int, most: float = 10.0):
 def test_observer_error_follows_its_sign(feedback, sign):
     """With f̂ = f the error obeys ė_a = ∓K₂ e_a: (1 ∓ K₂ dt)^k exactly."""
     K2, dt, n_ticks = 30.0, 1e-3, 100
-    observer = StateObserver(Observer(K2=[K2], feedback=feedback), 2, dt)
-    observer.reset(np.zeros(2))
+    observer = build_observer(Observer(K2=[K2], feedback=feedback), 2, dt)
+    start(observer, np.zeros(2))
     x = np.array([0.1, -0.2])  # the plant stands still, the observer starts off by x
     f_hat, Bu = np.array([0.7, -0.3]), np.array([-0.7, 0.3])
     for _ in range(n_ticks):
-        observer.compare(x)
-        observer.advance(f_hat, Bu)
-    assert np.allclose(observer.compare(x), x * (1 + sign * K2 * dt) ** n_ticks, rtol=1e-12)
+        compare(observer, x)
+        advance(observer, f_hat, Bu)
+    compare(observer, x)
+    assert np.allclose(observer.e_obs, x * (1 + sign * K2 * dt) ** n_ticks, rtol=1e-12)
 
 
 def test_observer_gain_may_differ_by_state_as_the_paper_prints_it():
-    observer = StateObserver(Observer(K2=[3.0, 30.0]), 2, 0.01)
-    observer.reset(np.zeros(2))
-    observer.compare(np.ones(2))
-    observer.advance(np.zeros(2), np.zeros(2))
+    observer = build_observer(Observer(K2=[3.0, 30.0]), 2, 0.01)
+    start(observer, np.zeros(2))
+    compare(observer, np.ones(2))
+    advance(observer, np.zeros(2), np.zeros(2))
     assert observer.x_hat.tolist() == pytest.approx([0.03, 0.3])
 
 
 def test_observer_error_settles_at_model_error_over_gain():
     """ė_a = f̃ − K₂ e_a ⇒ e_a → f̃/K₂: the observer's K₂ e_a estimates what f̂ misses."""
-    observer = StateObserver(Observer(), 1, 1e-3)
-    observer.reset(np.zeros(1))
+    observer = build_observer(Observer(), 1, 1e-3)
+    start(observer, np.zeros(1))
     x, velocity = np.zeros(1), 2.0
     for k in range(1000):
         x[0] = velocity * k * 1e-3
-        observer.compare(x)
-        observer.advance(np.zeros(1), np.zeros(1))
+        compare(observer, x)
+        advance(observer, np.zeros(1), np.zeros(1))
     assert observer.e_obs[0] * 30.0 == pytest.approx(velocity, rel=1e-9)
 
 
@@ -107,34 +116,43 @@ def test_command_is_the_general_inversion_of_the_paper(make_scenario, two_link, 
     slack = [[1.0, 0.2], [0.1, 0.9], [-3.0, 0.5], [0.0, -4.0]]
     spec = Inversion(K=[5.0, 6.0, 7.0, 8.0], slack_matrix=slack, effectiveness=effectiveness)
     nominal = NominalModel(make_scenario(), two_link)
-    inversion = DynamicInversion(spec, 2, nominal)
+    inversion = build_inversion(spec, 2, nominal.view)
     x, x_ref, xd_ref, f_hat = np.random.default_rng(0).normal(size=(4, 4))
-    tau = inversion.command(x, x_ref, xd_ref, f_hat)
+    invert(inversion, x, x_ref, xd_ref, f_hat)
+    tau = inversion.tau
     B2 = 0.4 * np.eye(2) if kind == "constant" else np.linalg.inv(ARM.inertia(x[:2]))
     B = np.vstack([np.zeros((2, 2)), B2])
     r = xd_ref - f_hat - np.diag(spec.K) @ (x - x_ref)
     expected, _ = invert_augmented(B, np.array(slack), r, np.array([3.0, -1.0]))
     assert np.allclose(tau, expected, rtol=1e-10)
     assert np.allclose(inversion.Bu, B @ tau, rtol=1e-10)
-    assert np.allclose(inversion.effect(tau), B @ tau, rtol=1e-10)
+    assert np.allclose(inversion.B2_inv @ B2, np.eye(2), atol=1e-10)
 
 
 def test_perfect_model_leaves_the_linear_error_equation(make_scenario, two_link):
     """f̂ = f and B exact ⇒ ë + (K+λ) ė + Kλ e = 0."""
     K, lam = 6.0, 4.0
-    inversion = DynamicInversion(
-        Inversion(K=[K], lam=lam), 2, NominalModel(make_scenario(), two_link)
-    )
+    nominal = NominalModel(make_scenario(), two_link)
+    inversion = build_inversion(Inversion(K=[K], lam=lam), 2, nominal.view)
     q, qd, q_ref, qd_ref, qdd_ref = np.random.default_rng(4).normal(size=(5, 2))
     f = np.concatenate([qd, ARM.acceleration(q, qd, np.zeros(2))])
-    tau = inversion.command(
+    invert(
+        inversion,
         np.concatenate([q, qd]),
         np.concatenate([q_ref, qd_ref]),
         np.concatenate([qd_ref, qdd_ref]),
         f,
     )
-    edd = ARM.acceleration(q, qd, tau) - qdd_ref
+    edd = ARM.acceleration(q, qd, inversion.tau) - qdd_ref
     assert np.allclose(edd + (K + lam) * (qd - qd_ref) + K * lam * (q - q_ref), 0, atol=1e-10)
+
+
+@given(arrays(float, (3, 3), elements=st.floats(-3, 3)), vectors(3))
+def test_cholesky_solves_as_numpy_does(root, b):
+    A = root @ root.T + np.eye(3)
+    x, L = np.zeros(3), np.zeros((3, 3))
+    solve_spd(A, b, x, L)
+    assert np.allclose(x, np.linalg.solve(A, b), rtol=1e-9, atol=1e-9)
 
 
 # Theory of learning
@@ -142,14 +160,7 @@ def test_perfect_model_leaves_the_linear_error_equation(make_scenario, two_link)
 
 def kernel_loss(shape, w, x, e_obs):
     """ℓ(W) = −e_aᵀ f̂(X; W) and its gradient, the one that trains the network."""
-    sizes, code = np.array(shape.sizes), kernel.ACTIVATIONS[shape.activation]
-    acts = np.zeros(kernel.activations_size(shape.sizes))
-    out = kernel.forward(w, sizes, shape.bias, code, x, acts)
-    loss = -float(e_obs @ acts[out:-1])
-    deltas, g = np.zeros_like(acts), np.zeros_like(w)
-    deltas[out:-1] = -e_obs
-    kernel.gradient(w, sizes, shape.bias, code, acts, deltas, g)
-    return loss, g
+    return loss_and_gradient(shape, w, x, -e_obs)
 
 
 def descent_bound(shape, w, g):
@@ -224,7 +235,7 @@ def test_deep_relative_trust_does_not_hold_on_the_papers_network():
 
 
 def test_monitored_bound_is_theorem_ones_by_definition():
-    spec = Network(hidden=(6, 5))
+    spec = Network(hidden=(6, 5), precision="float64")
     learner = build_learner(spec, Madam(), 4, 3, seed=2)
     rng = np.random.default_rng(3)
     x, delta = rng.normal(size=4), rng.normal(size=3)
@@ -244,7 +255,7 @@ def test_monitored_bound_is_theorem_ones_by_definition():
         assert learner.monitors.update_ratio[k] == pytest.approx(ratio, rel=1e-9)
         assert learner.monitors.weight_norm[k] == pytest.approx(np.linalg.norm(w), rel=1e-12)
         product *= 1 + ratio
-    assert learner.monitors.drt_bound == pytest.approx(product - 1, rel=1e-9)
+    assert learner.monitors.drt_bound[0] == pytest.approx(product - 1, rel=1e-9)
 
 
 def test_a_layer_without_gradient_has_no_descent_guarantee():
@@ -252,51 +263,72 @@ def test_a_layer_without_gradient_has_no_descent_guarantee():
     learner.predict(np.ones(2))
     learner.learn(np.zeros(2))
     assert learner.monitors.eta_bound.tolist() == [0.0, 0.0]
-    assert learner.monitors.drt_bound == 0.0
+    assert learner.monitors.drt_bound[0] == 0.0
 
 
 # Theory of tracking
 
 
+def started_bounds(spec, dt, e_track, *, first_order=False):
+    bounds = build_bounds(spec, 1, dt, first_order=first_order)
+    start_bounds(bounds, e_track)
+    return bounds
+
+
 def test_bound_settles_at_epsilon_over_k_lambda():
     K, lam, eps, dt = 7.5, 5.0, 0.6, 1e-3
-    bounds = TrackingBounds(Inversion(K=[K], lam=lam), 1, dt, np.array([0.5, 0.0]))
-    assert bounds.joint == 0.5
+    bounds = started_bounds(Inversion(K=[K], lam=lam), dt, np.array([0.5, 0.0]))
+    assert bounds.joint[0] == 0.5
     for _ in range(5000):
-        bounds.begin(np.array([0.1, eps - lam * 0.1]))  # f̃₂ + λ f̃₁ = ε
-        bounds.end(np.zeros(2), np.array([eps]))
-    assert bounds.joint == pytest.approx(eps / (K * lam), rel=1e-8)
-    assert bounds.paper == pytest.approx(np.hypot(0.1, 0.1) / K, rel=1e-9)
+        begin_period(bounds, np.array([0.1, eps - lam * 0.1]), np.zeros(1))  # f̃₂ + λ f̃₁ = ε
+        end_period(bounds, np.zeros(2), np.array([eps]), np.zeros(1))
+    assert bounds.joint[0] == pytest.approx(eps / (K * lam), rel=1e-8)
+    assert bounds.paper[0] == pytest.approx(np.hypot(0.1, 0.1) / K, rel=1e-9)
 
 
 def test_bound_is_reached_by_the_worst_disturbance_and_never_passed():
     """One joint, s and e at their limits under constant d: the bound is an equality."""
     K, lam, d, dt = 7.5, 7.5, 2.0, 1e-4
     e, ed = 0.3, 0.4
-    bounds = TrackingBounds(Inversion(K=[K], lam=lam), 1, dt, np.array([e, ed]))
+    bounds = started_bounds(Inversion(K=[K], lam=lam), dt, np.array([e, ed]))
     ratios = []
     for _ in range(20_000):
         edd = d - (K + lam) * ed - K * lam * e
-        bounds.begin(np.array([0.0, d]))
+        begin_period(bounds, np.array([0.0, d]), np.array([edd]))
         e, ed = e + dt * ed + 0.5 * dt**2 * edd, ed + dt * edd
-        bounds.end(np.array([e, ed]), np.array([d - (K + lam) * ed - K * lam * e]))
-        ratios.append(abs(e) / bounds.joint)
+        edd = d - (K + lam) * ed - K * lam * e
+        end_period(bounds, np.array([e, ed]), np.array([edd]), np.zeros(1))
+        ratios.append(abs(e) / bounds.joint[0])
     assert max(ratios) <= 1.001
     assert ratios[-1] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_bound_is_undefined_for_gains_that_are_not_scalar():
     for spec in (Inversion(K=[1.0, 2.0]), Inversion(slack_matrix=[[1.0], [-2.0]], K=[1.0, 2.0])):
-        bounds = TrackingBounds(spec, 1, 1e-3, np.zeros(2))
-        bounds.begin(np.ones(2))
-        bounds.end(np.ones(2), np.ones(1))
-        assert bounds.joint == UNDEFINED
-        assert bounds.paper > 0
+        bounds = started_bounds(spec, 1e-3, np.zeros(2))
+        begin_period(bounds, np.ones(2), np.ones(1))
+        end_period(bounds, np.ones(2), np.ones(1), np.zeros(1))
+        assert bounds.joint[0] == UNDEFINED
+        assert bounds.paper[0] > 0
 
 
 def test_without_slack_coupling_the_joint_bound_integrates_s():
     """λ = 0: no position feedback, |e| ≤ |e₀| + ∫|s|."""
-    bounds = TrackingBounds(Inversion(lam=0.0), 1, 0.01, np.array([0.2, 1.0]))
-    bounds.begin(np.zeros(2))
-    bounds.end(np.zeros(2), np.zeros(1))
-    assert bounds.joint == pytest.approx(0.2 + 0.01 * 1.0)
+    bounds = started_bounds(Inversion(lam=0.0), 0.01, np.array([0.2, 1.0]))
+    begin_period(bounds, np.zeros(2), np.zeros(1))
+    end_period(bounds, np.zeros(2), np.zeros(1), np.zeros(1))
+    assert bounds.joint[0] == pytest.approx(0.2 + 0.01 * 1.0)
+
+
+def test_bound_adds_what_a_first_order_integrator_slips():
+    """½dt²·q̈ in q and ½dt·Δq̈ in q̇ each period, and nothing with RK4."""
+    exact, slipping = (
+        started_bounds(Inversion(lam=0.0), 0.01, np.zeros(2), first_order=flag)
+        for flag in (False, True)
+    )
+    for bounds in (exact, slipping):
+        begin_period(bounds, np.zeros(2), np.array([3.0]))
+        end_period(bounds, np.zeros(2), np.array([5.0]), np.array([5.0]))
+    assert exact.joint[0] == exact.s[0] == 0.0
+    assert slipping.s[0] == pytest.approx(0.5 * 0.01 * 2.0)
+    assert slipping.joint[0] == pytest.approx(0.5 * 0.01**2 * 3.0 + 0.01 * slipping.s[0])

@@ -95,7 +95,9 @@ def test_the_first_update_is_eta_by_sign_and_bolder_by_one_over_the_root_of_one_
 
 
 def test_without_learning_the_last_weights_know_what_the_live_ones_knew():
-    found = ledger.measure(("duration=0.2 controller.madam.eta=1e-12", 0))
+    found = ledger.measure(
+        ("duration=0.2 controller.madam.eta=1e-12 controller.network.precision=float64", 0)
+    )
     assert found["recall_half"] == pytest.approx(found["f_err_rms_steady"], rel=1e-6)
     learning = ledger.measure(("duration=0.2", 0))
     assert learning["recall_half"] != pytest.approx(learning["f_err_rms_steady"], rel=0.1)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from dnnmso_mj.dynamics import TwoLink
-from dnnmso_mj.errors import NonFiniteError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf
@@ -158,7 +157,7 @@ def test_bound_would_be_left_if_the_disturbance_were_counted_short(make_scenario
     ("kind", "outputs"), [("dnn_mso", "full"), ("dnn_mso", "kinematic"), ("classical_mso", "full")]
 )
 def test_torch_in_the_loop_drives_the_same_run(make_scenario, kind, outputs):
-    network = {"hidden": [16, 16], "outputs": outputs}
+    network = {"hidden": [16, 16], "outputs": outputs, "precision": "float64"}
     fast = simulate(make_scenario({"kind": kind, "network": network}, duration=0.3))
     network = network | {"backend": "torch"}
     slow = simulate(make_scenario({"kind": kind, "network": network}, duration=0.3))
@@ -260,11 +259,14 @@ def test_a_state_out_of_this_world_ends_the_run(make_scenario):
     assert len(trace) == 1
 
 
-def test_weights_that_are_not_finite_are_named(make_scenario, two_link):
-    controller = Simulation(make_scenario(), two_link).controller
-    state = controller.state()
+@pytest.mark.parametrize("backend", ["kernel", "torch"])
+def test_weights_that_are_not_finite_are_named(make_scenario, two_link, backend):
+    scenario = make_scenario({"kind": "dnn_mso", "network": {"backend": backend}}, duration=0.1)
+    simulation = Simulation(scenario, two_link)
+    state = simulation.controller.state()
     state["weights"][7] = np.nan
-    controller.restore(state)
-    controller.reset(np.zeros(4))
-    with pytest.raises(NonFiniteError, match="of layer"):
-        controller.update(np.ones(4), np.zeros(4), np.zeros(4))
+    simulation.controller.restore(state)
+    info = simulation.run(MemoryRecorder(simulation.layout, scenario.n_ticks))
+    assert info.status == "diverged"
+    assert "weights" in info.reason
+    assert info.reason.endswith("at t = 0 s")

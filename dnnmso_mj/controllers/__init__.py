@@ -2,55 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Protocol
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from dnnmso_mj.inversion import DynamicInversion
-from dnnmso_mj.learner import Monitors
-from dnnmso_mj.observer import StateObserver
+from dnnmso_mj.monitors import Monitors
 from dnnmso_mj.plant import Mjcf, NominalModel
 from dnnmso_mj.scenario import ClassicalMso, DnnMso, NoNetwork, Scenario
+
+if TYPE_CHECKING:
+    from dnnmso_mj.tick import World
 
 Array = np.ndarray
 
 
-@dataclass
-class Command:
+class Command(NamedTuple):
     """What a controller decided in one tick, and what is worth logging of it.
 
     Arrays belong to the controller and are overwritten by its next update.
     """
 
-    tau: Array
-    """Torque (n,) N·m."""
-    Bu: Array
-    """B τ (2n,): the effect of `tau` as the controller sees it."""
-    x_hat: Array
-    """Observer state X̂ (2n,) that e_obs was taken from."""
-    f_hat: Array
-    """Learned (or known) dynamics f̂ (2n,)."""
-    e_obs: Array
-    """Observer error X − X̂ (2n,)."""
-    monitors: Monitors = field(default_factory=lambda: Monitors.zeros(0))
-    """Monitors of the network's update; empty without a network."""
+    tau: Array  # torque (n,) N·m
+    Bu: Array  # B τ (2n,): the effect of `tau` as the controller sees it
+    B2_inv: Array  # (n, n): another torque's effect is [0; B2_inv⁻¹ τ]
+    x_hat: Array  # observer state X̂ (2n,) that e_obs was taken from
+    f_hat: Array  # learned (or known) dynamics f̂ (2n,)
+    e_obs: Array  # observer error X − X̂ (2n,)
+    monitors: Monitors  # of the network's update; empty without a network
 
-    @classmethod
-    def of(cls, inversion: DynamicInversion, observer: StateObserver, f_hat: Array) -> Command:
-        """A command that shows what these parts hold, without copying it on each tick."""
-        return cls(
-            tau=inversion.tau,
-            Bu=inversion.Bu,
-            x_hat=np.zeros_like(observer.x_hat),
-            f_hat=f_hat,
-            e_obs=observer.e_obs,
-        )
+
+def command_of(inversion: DynamicInversion, e_obs: Array, monitors: Monitors) -> Command:
+    """A command that shows what these parts hold, with its own x_hat and f_hat."""
+    x_hat, f_hat = np.zeros((2, e_obs.size))
+    return Command(
+        tau=inversion.tau,
+        Bu=inversion.Bu,
+        B2_inv=inversion.B2_inv,
+        x_hat=x_hat,
+        f_hat=f_hat,
+        e_obs=e_obs,
+        monitors=monitors,
+    )
+
+
+class CompiledTicks(NamedTuple):
+    """A controller's whole ticks as compiled code."""
+
+    run: Callable[[World, Any, int, int], int]
+    """(world, parts, first, count) -> ticks done; see `tick`."""
+    parts: Any
+    """The controller's arrays, a NamedTuple."""
+    update: Callable[..., Command]
+    """The method that `run` stands for: a controller with another `update` is not run by it."""
 
 
 class Controller(Protocol):
-    """What the loop asks of a controller; `n_layers` weight layers, 0 without a network."""
+    """What the loop asks of a controller; `n_layers` weight layers, 0 without a network.
+
+    One with an attribute `ticks` of `CompiledTicks` runs without the interpreter.
+    """
 
     n_layers: int
 
@@ -60,9 +72,6 @@ class Controller(Protocol):
     def update(self, x: Array, x_ref: Array, xd_ref: Array) -> Command:
         """Command the torque for measured x, reference x_ref and its derivative, each (2n,)."""
 
-    def effect(self, tau: Array) -> Array:
-        """B τ (2n,) of a torque other than the commanded one, at the state of the last update."""
-
     def state(self) -> dict[str, Array]:
         """Everything that the next update depends on."""
 
@@ -70,8 +79,21 @@ class Controller(Protocol):
         """Go on from a `state`."""
 
 
-def build_controller(scenario: Scenario, mjcf: Mjcf) -> Controller:
-    """The controller that a scenario names, with its own nominal model of the robot."""
+def compiled_ticks(controller: Controller) -> CompiledTicks | None:
+    """A controller's own compiled ticks; None if it has none, is wrapped, or overrides `update`."""
+    ticks: CompiledTicks | None = getattr(controller, "ticks", None)
+    method = getattr(controller.update, "__func__", None)
+    return ticks if ticks is not None and method is ticks.update else None
+
+
+def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> Controller:
+    """The controller that a scenario names, with its own nominal model of the robot.
+
+    Args:
+        scenario: the experiment.
+        mjcf: the model that it names.
+        watch: whether the monitors of the network are kept; they change nothing else.
+    """
     from dnnmso_mj.controllers.classical_mso import ClassicalMsoController
     from dnnmso_mj.controllers.dnn_mso import DnnMsoController
     from dnnmso_mj.controllers.no_network import NoNetworkController
@@ -80,8 +102,8 @@ def build_controller(scenario: Scenario, mjcf: Mjcf) -> Controller:
     spec, n, dt = scenario.controller, scenario.n_joints, scenario.dt
     match spec:
         case DnnMso():
-            return DnnMsoController(spec, n, dt, scenario.seed, nominal)
+            return DnnMsoController(spec, n, dt, scenario.seed, nominal, watch=watch)
         case NoNetwork():
             return NoNetworkController(spec, n, dt, nominal)
         case ClassicalMso():
-            return ClassicalMsoController(spec, n, dt, scenario.seed, nominal)
+            return ClassicalMsoController(spec, n, dt, scenario.seed, nominal, watch=watch)

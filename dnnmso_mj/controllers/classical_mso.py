@@ -14,17 +14,45 @@ cites train d̂ by gradient laws of their own; here Madam trains it, so that onl
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from dnnmso_mj.controllers import Command
-from dnnmso_mj.inversion import DynamicInversion
-from dnnmso_mj.learner import build_learner
-from dnnmso_mj.observer import StateObserver
-from dnnmso_mj.plant import NominalModel
+from dnnmso_mj import monitors
+from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.controllers import Command, CompiledTicks, command_of
+from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert, solve_spd
+from dnnmso_mj.kernel import Net, forward
+from dnnmso_mj.learner import KernelLearner, build_learner
+from dnnmso_mj.monitors import Watch
+from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
+from dnnmso_mj.plant import Nominal, NominalModel, bias, inertia
 from dnnmso_mj.scenario import ClassicalMso
+from dnnmso_mj.tick import World, begin_tick, end_tick, timed_from, timed_to
 
 Array = np.ndarray
+
+
+class Parts(NamedTuple):
+    """The controller's arrays."""
+
+    nominal: Nominal
+    inversion: DynamicInversion
+    observer: StateObserver
+    command: Command
+    f_obs: Array  # (2n,) what the observer integrates
+    learned: Array  # (n,) B₂ d̂
+    delta: Array  # (n,) ∂loss/∂d̂
+    free: Array  # (n,) scratch
+    L: Array  # (n, n) scratch
+
+
+class LearningParts(NamedTuple):
+    """The same with the compiled network."""
+
+    law: Parts
+    net: Net
+    watch: Watch
 
 
 class ClassicalMsoController:
@@ -36,53 +64,112 @@ class ClassicalMsoController:
         dt: control period (s).
         seed: of the initial weights.
         nominal: the controller's own model of the robot, read for f and B.
+        watch: whether the monitors are kept.
     """
 
     def __init__(
-        self, spec: ClassicalMso, n_joints: int, dt: float, seed: int, nominal: NominalModel
+        self,
+        spec: ClassicalMso,
+        n_joints: int,
+        dt: float,
+        seed: int,
+        nominal: NominalModel,
+        *,
+        watch: bool = True,
     ) -> None:
         n = n_joints
-        self._n, self._nominal = n, nominal
-        self.inversion = DynamicInversion(spec.inversion, n, nominal)
-        self.observer = StateObserver(spec.observer, 2 * n, dt)
-        self.learner = build_learner(spec.network, spec.madam, 2 * n, n, seed)
+        self.learner = build_learner(spec.network, spec.madam, 2 * n, n, seed, watch=watch)
         self.n_layers = self.learner.shape.n_layers
-        self._f_hat, self._f_obs = np.zeros(2 * n), np.zeros(2 * n)
-        self._command = Command.of(self.inversion, self.observer, self._f_hat)
-        self._command.monitors = self.learner.monitors
+        self._nominal = nominal  # keeps alive what compiled code knows by address
+        inversion = build_inversion(spec.inversion, n, nominal.view)
+        observer = build_observer(spec.observer, 2 * n, dt)
+        self._parts = Parts(
+            nominal=nominal.view,
+            inversion=inversion,
+            observer=observer,
+            command=command_of(inversion, observer.e_obs, self.learner.monitors),
+            f_obs=np.zeros(2 * n),
+            learned=np.zeros(n),
+            delta=np.zeros(n),
+            free=np.zeros(n),
+            L=np.zeros((n, n)),
+        )
+        self.ticks = None
+        if isinstance(self.learner, KernelLearner):
+            parts = LearningParts(self._parts, self.learner.net, self.learner.watch)
+            self.ticks = CompiledTicks(run_ticks, parts, ClassicalMsoController.update)
 
     def reset(self, x: Array) -> None:
-        self.observer.reset(x)
+        start(self._parts.observer, x)
 
     def update(self, x: Array, x_ref: Array, xd_ref: Array) -> Command:
-        n = self._n
-        e_obs = self.observer.compare(x)
-        self._command.x_hat[:] = self.observer.x_hat
-        d_hat = self.learner.predict(x)
-        self._known(x, self._f_hat)
-        B2_inv = self._nominal.inertia(x[:n])
-        learned = np.linalg.solve(B2_inv, d_hat)  # B₂ d̂ (n,)
-        self._f_hat[n:] += learned
-        self.inversion.command(x, x_ref, xd_ref, self._f_hat)
-        self.learner.learn(-np.linalg.solve(B2_inv, e_obs[n:]))  # B₂ is symmetric
-        self._known(self.observer.x_hat, self._f_obs)
-        self._f_obs[n:] += learned
-        self.observer.advance(self._f_obs, self.inversion.Bu)
-        return self._command
-
-    def _known(self, x: Array, out: Array) -> None:
-        """f(x) = [q̇; −M⁻¹(V + G)] (2n,) of the nominal model."""
-        n = self._n
-        bias = self._nominal.bias(x[:n], x[n:])
-        out[:n] = x[n:]
-        out[n:] = np.linalg.solve(self._nominal.inertia(x[:n]), -bias)
-
-    def effect(self, tau: Array) -> Array:
-        return self.inversion.effect(tau)
+        if self.ticks is not None:
+            update(self.ticks.parts, x, x_ref, xd_ref)
+        else:
+            command_with(self._parts, self.learner.predict(x), x, x_ref, xd_ref)
+            self.learner.learn(self._parts.delta)
+        return self._parts.command
 
     def state(self) -> dict[str, Array]:
-        return {"x_hat": self.observer.x_hat.copy(), **self.learner.state()}
+        return {"x_hat": self._parts.observer.x_hat.copy(), **self.learner.state()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        self.observer.reset(state["x_hat"])
+        start(self._parts.observer, state["x_hat"])
         self.learner.restore(state)
+
+
+@inner
+def command_with(parts: Parts, d_hat: Array, x: Array, x_ref: Array, xd_ref: Array) -> None:
+    """Everything of a tick but the network: command with d̂ (n,), leave ∂loss/∂d̂ in `delta`."""
+    n, observer, command = d_hat.size, parts.observer, parts.command
+    compare(observer, x)
+    copy(observer.x_hat, command.x_hat)
+    _known(parts, x, command.f_hat)
+    for i in range(n):
+        parts.free[i] = d_hat[i]
+    solve_spd(parts.nominal.M, parts.free, parts.learned, parts.L)
+    for i in range(n):
+        command.f_hat[n + i] += parts.learned[i]
+    invert(parts.inversion, x, x_ref, xd_ref, command.f_hat)
+    solve_spd(parts.nominal.M, observer.e_obs[n:], parts.delta, parts.L)  # B₂ is symmetric
+    for i in range(n):
+        parts.delta[i] = -parts.delta[i]
+    _known(parts, observer.x_hat, parts.f_obs)
+    for i in range(n):
+        parts.f_obs[n + i] += parts.learned[i]
+    advance(observer, parts.f_obs, parts.inversion.Bu)
+
+
+@inner
+def _known(parts: Parts, x: Array, out: Array) -> None:
+    """f(x) = [q̇; −M⁻¹(V + G)] (2n,) of the nominal model, whose M(q) stays behind."""
+    n = parts.free.size
+    inertia(parts.nominal, x[:n])
+    bias(parts.nominal, x[:n], x[n:])
+    solve_spd(parts.nominal.M, parts.nominal.bias, parts.free, parts.L)
+    for i in range(n):
+        out[i], out[n + i] = x[n + i], -parts.free[i]
+
+
+@inner
+def update(parts: LearningParts, x: Array, x_ref: Array, xd_ref: Array) -> None:
+    """One tick of the law above."""
+    law, net = parts.law, parts.net
+    command_with(law, forward(net, x), x, x_ref, xd_ref)
+    delta = net.slots[net.strides.size]
+    for i in range(law.delta.size):
+        net.deltas[delta + i] = law.delta[i]
+    monitors.learn(net, parts.watch, law.command.monitors)
+
+
+@compiled
+def run_ticks(world: World, parts: LearningParts, first: int, count: int) -> int:
+    """Ticks first to first + count of the closed loop; returns how many were done."""
+    for k in range(first, first + count):
+        if begin_tick(world, k):
+            timed_from(world)
+            update(parts, world.x, world.x_ref, world.xd_ref)
+            timed_to(world)
+        if end_tick(world, parts.law.command, k):
+            return k + 1 - first
+    return count

@@ -10,17 +10,34 @@ Each tick commands with the weights it has, and then learns from the observer's 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from dnnmso_mj.controllers import Command
-from dnnmso_mj.inversion import DynamicInversion
-from dnnmso_mj.learner import build_learner
-from dnnmso_mj.observer import StateObserver
+from dnnmso_mj import monitors
+from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.controllers import Command, CompiledTicks, command_of
+from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert
+from dnnmso_mj.kernel import Net, forward
+from dnnmso_mj.learner import KernelLearner, build_learner
+from dnnmso_mj.monitors import Watch
+from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.scenario import DnnMso
+from dnnmso_mj.tick import World, begin_tick, end_tick, timed_from, timed_to
 
 Array = np.ndarray
+
+
+class Parts(NamedTuple):
+    """The arrays of the compiled controller."""
+
+    inversion: DynamicInversion
+    observer: StateObserver
+    net: Net
+    watch: Watch
+    command: Command
+    known: int  # how many rows of f̂ are the measured velocity instead of learned
 
 
 class DnnMsoController:
@@ -32,43 +49,96 @@ class DnnMsoController:
         dt: control period (s).
         seed: of the initial weights.
         nominal: the controller's own model of the robot, read for B alone.
+        watch: whether the monitors are kept.
     """
 
     def __init__(
-        self, spec: DnnMso, n_joints: int, dt: float, seed: int, nominal: NominalModel
+        self,
+        spec: DnnMso,
+        n_joints: int,
+        dt: float,
+        seed: int,
+        nominal: NominalModel,
+        *,
+        watch: bool = True,
     ) -> None:
         n = n_joints
-        # outputs: kinematic leaves the upper rows to the measured velocity.
-        self._first = n if spec.network.outputs == "kinematic" else 0
-        self._n = n
-        self.inversion = DynamicInversion(spec.inversion, n, nominal)
-        self.observer = StateObserver(spec.observer, 2 * n, dt)
-        self.learner = build_learner(spec.network, spec.madam, 2 * n, 2 * n - self._first, seed)
+        self._known = n if spec.network.outputs == "kinematic" else 0
+        self._nominal = nominal  # keeps alive what compiled code knows by address
+        self.inversion = build_inversion(spec.inversion, n, nominal.view)
+        self.observer = build_observer(spec.observer, 2 * n, dt)
+        n_out = 2 * n - self._known
+        self.learner = build_learner(spec.network, spec.madam, 2 * n, n_out, seed, watch=watch)
         self.n_layers = self.learner.shape.n_layers
-        self._f_hat = np.zeros(2 * n)
-        self._delta = np.zeros(2 * n - self._first)
-        self._command = Command.of(self.inversion, self.observer, self._f_hat)
-        self._command.monitors = self.learner.monitors
+        self.command = command_of(self.inversion, self.observer.e_obs, self.learner.monitors)
+        self.ticks = None
+        if isinstance(self.learner, KernelLearner):
+            parts = Parts(
+                inversion=self.inversion,
+                observer=self.observer,
+                net=self.learner.net,
+                watch=self.learner.watch,
+                command=self.command,
+                known=self._known,
+            )
+            self.ticks = CompiledTicks(run_ticks, parts, DnnMsoController.update)
 
     def reset(self, x: Array) -> None:
-        self.observer.reset(x)
+        start(self.observer, x)
 
     def update(self, x: Array, x_ref: Array, xd_ref: Array) -> Command:
-        e_obs = self.observer.compare(x)
-        self._command.x_hat[:] = self.observer.x_hat
-        self._f_hat[: self._first] = x[self._n :][: self._first]
-        self._f_hat[self._first :] = self.learner.predict(x)
-        self.inversion.command(x, x_ref, xd_ref, self._f_hat)
-        self.learner.learn(np.negative(e_obs[self._first :], out=self._delta))
-        self.observer.advance(self._f_hat, self.inversion.Bu)
-        return self._command
+        if self.ticks is not None:
+            update(self.ticks.parts, x, x_ref, xd_ref)
+        else:
+            self._update_with_any_learner(x, x_ref, xd_ref)
+        return self.command
 
-    def effect(self, tau: Array) -> Array:
-        return self.inversion.effect(tau)
+    def _update_with_any_learner(self, x: Array, x_ref: Array, xd_ref: Array) -> None:
+        """What `update` below compiles."""
+        observer, command, known = self.observer, self.command, self._known
+        compare(observer, x)
+        copy(observer.x_hat, command.x_hat)
+        command.f_hat[:known] = x[known : 2 * known]
+        command.f_hat[known:] = self.learner.predict(x)
+        invert(self.inversion, x, x_ref, xd_ref, command.f_hat)
+        self.learner.learn(-observer.e_obs[known:])
+        advance(observer, command.f_hat, self.inversion.Bu)
 
     def state(self) -> dict[str, Array]:
         return {"x_hat": self.observer.x_hat.copy(), **self.learner.state()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        self.observer.reset(state["x_hat"])
+        start(self.observer, state["x_hat"])
         self.learner.restore(state)
+
+
+@inner
+def update(parts: Parts, x: Array, x_ref: Array, xd_ref: Array) -> None:
+    """One tick of the law above."""
+    observer, command, net, known = parts.observer, parts.command, parts.net, parts.known
+    compare(observer, x)
+    copy(observer.x_hat, command.x_hat)
+    output = forward(net, x)
+    for i in range(known):
+        command.f_hat[i] = x[known + i]
+    for i in range(output.size):
+        command.f_hat[known + i] = output[i]
+    invert(parts.inversion, x, x_ref, xd_ref, command.f_hat)
+    delta = net.slots[net.strides.size]
+    for i in range(output.size):
+        net.deltas[delta + i] = -observer.e_obs[known + i]
+    monitors.learn(net, parts.watch, command.monitors)
+    advance(observer, command.f_hat, parts.inversion.Bu)
+
+
+@compiled
+def run_ticks(world: World, parts: Parts, first: int, count: int) -> int:
+    """Ticks first to first + count of the closed loop; returns how many were done."""
+    for k in range(first, first + count):
+        if begin_tick(world, k):
+            timed_from(world)
+            update(parts, world.x, world.x_ref, world.xd_ref)
+            timed_to(world)
+        if end_tick(world, parts.command, k):
+            return k + 1 - first
+    return count

@@ -9,16 +9,29 @@ observer runs along, so that its error shows what a network would have had to le
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from dnnmso_mj.controllers import Command
-from dnnmso_mj.inversion import DynamicInversion
-from dnnmso_mj.observer import StateObserver
+from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.controllers import Command, CompiledTicks, command_of
+from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert
+from dnnmso_mj.monitors import Monitors
+from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.scenario import NoNetwork
+from dnnmso_mj.tick import World, begin_tick, end_tick, timed_from, timed_to
 
 Array = np.ndarray
+
+
+class Parts(NamedTuple):
+    """The controller's arrays."""
+
+    inversion: DynamicInversion
+    observer: StateObserver
+    command: Command
+    known: int  # how many rows of f̂ are the measured velocity
 
 
 class NoNetworkController:
@@ -34,31 +47,48 @@ class NoNetworkController:
     n_layers = 0
 
     def __init__(self, spec: NoNetwork, n_joints: int, dt: float, nominal: NominalModel) -> None:
-        n = n_joints
-        self._n = n
-        self._kinematics = spec.kinematics
-        self.inversion = DynamicInversion(spec.inversion, n, nominal)
-        self.observer = StateObserver(spec.observer, 2 * n, dt)
-        self._f_hat = np.zeros(2 * n)
-        self._command = Command.of(self.inversion, self.observer, self._f_hat)
+        self._nominal = nominal  # keeps alive what compiled code knows by address
+        inversion = build_inversion(spec.inversion, n_joints, nominal.view)
+        observer = build_observer(spec.observer, 2 * n_joints, dt)
+        command = command_of(inversion, observer.e_obs, Monitors.zeros(0))
+        known = n_joints if spec.kinematics else 0
+        self._parts = Parts(inversion, observer, command, known)
+        self.ticks = CompiledTicks(run_ticks, self._parts, NoNetworkController.update)
 
     def reset(self, x: Array) -> None:
-        self.observer.reset(x)
+        start(self._parts.observer, x)
 
     def update(self, x: Array, x_ref: Array, xd_ref: Array) -> Command:
-        self.observer.compare(x)
-        self._command.x_hat[:] = self.observer.x_hat
-        if self._kinematics:
-            self._f_hat[: self._n] = x[self._n :]
-        self.inversion.command(x, x_ref, xd_ref, self._f_hat)
-        self.observer.advance(self._f_hat, self.inversion.Bu)
-        return self._command
-
-    def effect(self, tau: Array) -> Array:
-        return self.inversion.effect(tau)
+        update(self._parts, x, x_ref, xd_ref)
+        return self._parts.command
 
     def state(self) -> dict[str, Array]:
-        return {"x_hat": self.observer.x_hat.copy()}
+        return {"x_hat": self._parts.observer.x_hat.copy()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        self.observer.reset(state["x_hat"])
+        start(self._parts.observer, state["x_hat"])
+
+
+@inner
+def update(parts: Parts, x: Array, x_ref: Array, xd_ref: Array) -> None:
+    """One tick of the law above."""
+    observer, command = parts.observer, parts.command
+    compare(observer, x)
+    copy(observer.x_hat, command.x_hat)
+    for i in range(parts.known):
+        command.f_hat[i] = x[parts.known + i]
+    invert(parts.inversion, x, x_ref, xd_ref, command.f_hat)
+    advance(observer, command.f_hat, parts.inversion.Bu)
+
+
+@compiled
+def run_ticks(world: World, parts: Parts, first: int, count: int) -> int:
+    """Ticks first to first + count of the closed loop; returns how many were done."""
+    for k in range(first, first + count):
+        if begin_tick(world, k):
+            timed_from(world)
+            update(parts, world.x, world.x_ref, world.xd_ref)
+            timed_to(world)
+        if end_tick(world, parts.command, k):
+            return k + 1 - first
+    return count

@@ -1,0 +1,78 @@
+"""How this package compiles: the decorators of everything that runs without the interpreter."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, TypeVar, cast
+
+import numpy as np
+from numba import njit
+from numba.core import event
+
+Array = np.ndarray
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def _sources() -> str:
+    """A digest of every source that is compiled, since each is compiled into its callers."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        text = path.read_bytes()
+        if b"@compiled" in text or b"@inner" in text or b"ExternalFunction" in text:
+            digest.update(text)
+    return digest.hexdigest()
+
+
+_SOURCES = _sources()
+
+
+def compiled(function: F) -> F:
+    """Compile a function when it is first called, and keep it on disk for later processes."""
+    return _compile(function, "never")
+
+
+def inner(function: F) -> F:
+    """The same for small parts of a tick, put in place in their callers.
+
+    A call that passes dozens of arrays takes longer to compile, and to do, than what it is for.
+    """
+    return _compile(function, "always")
+
+
+def _compile(function: F, inline: Literal["always", "never"]) -> F:
+    dispatcher: Any = njit(
+        cache=True,
+        nogil=True,
+        inline=inline,
+        error_model="numpy",
+        # Reassociation lets sums vectorise; NaN and infinity keep their meaning, to be caught.
+        fastmath={"reassoc", "contract", "arcp", "nsz"},
+    )(function)
+    # Code on disk is valid for these sources; numba would look at the function's own file alone.
+    dispatcher._cache._cache_file._source_stamp = _SOURCES
+    return cast(F, dispatcher)
+
+
+@compiled
+def copy(values: Array, out: Array) -> None:
+    """The first len(values) of `out` become `values`; a slice would compile its error message."""
+    for i in range(values.size):
+        out[i] = values[i]
+
+
+class CompileNotice(event.Listener):
+    """Says once, on standard error, why the first run of all takes seconds longer."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def on_start(self, event: event.Event) -> None:
+        if not self._said:
+            self._said = True
+            print("compiling the control loop; later runs load it", file=sys.stderr, flush=True)
+
+    def on_end(self, event: event.Event) -> None:
+        pass

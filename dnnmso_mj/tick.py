@@ -1,0 +1,255 @@
+"""One tick of the closed loop around a controller's update, compiled.
+
+    begin_tick      wait for t_k (in real time), read the sensors and the reference
+    update          the controller commands and learns
+    end_tick        actuators, true dynamics, the row for the log, one step of MuJoCo
+
+Tick k is at t_k = k·dt: time is computed, never accumulated. Every loop has these three calls; a
+controller's compiled loop has them in its own file (`run_ticks`), others are called by `simulate`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from dnnmso_mj.clock import now_ns, sleep_until
+from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.imperfections import Actuators, actuate
+from dnnmso_mj.inversion import solve_spd
+from dnnmso_mj.plant import PlantView, forward, integrate, solve_inertia
+from dnnmso_mj.theory import TrackingBounds, begin_period, end_period
+
+if TYPE_CHECKING:
+    from dnnmso_mj.controllers import Command
+
+Array = np.ndarray
+
+# rad, rad/s: no arm is there and comes back.
+DIVERGED_ABOVE = 1e3
+MUJOCO_ZEROES_ABOVE = 1e9  # N·m; from 1e10 on MuJoCo drops a torque with a mere warning
+
+# Why a loop ended: slots of `World.status`.
+RUNNING, TAU_NOT_FINITE, TAU_TOO_LARGE, ROW_NOT_FINITE, OUT_OF_RANGE = range(5)
+
+# Slots of `World.counts`.
+STATUS, ROWS, CHUNK_START, START_NS, CONTROLLED, STARTED_NS, TOOK_NS = range(7)
+N_COUNTS = 7
+
+# What acts on a joint whose command came too late.
+HOLD, ZERO, DAMPED = range(3)
+
+
+class Pace(NamedTuple):
+    """How ticks follow the wall clock."""
+
+    period_ns: int  # 0: not at all, as fast as can be
+    watchdog: int  # HOLD, ZERO or DAMPED
+    damping: float  # N·m·s/rad, of DAMPED
+    stalls: Array  # (m, 2) int64: tick and ns, where the controller is made to hang
+
+
+class World(NamedTuple):
+    """All that a tick touches but the controller; arrays, overwritten in place."""
+
+    plant: PlantView
+    actuators: Actuators
+    bounds: TrackingBounds
+    pace: Pace
+    q_ref: Array  # (chunk, n), and its derivatives
+    qd_ref: Array
+    qdd_ref: Array
+    x: Array  # (2n,)
+    x_ref: Array  # (2n,)
+    xd_ref: Array  # (2n,)
+    e_track: Array  # (2n,)
+    f_true: Array  # (2n,)
+    f_err: Array  # (2n,) what the closed loop feels of f̃, saturation included
+    tau: Array  # (n,) applied in the last period
+    qdd: Array  # (n,) scratch
+    L: Array  # (n, n) scratch
+    rows: Array  # (block, width): `trace.StepLayout`
+    counts: Array  # int64, see above
+    late_ns: Array  # (1,) int64, of this tick's wake-up
+    timespec: Array  # (2,) int64 scratch
+    dt: float
+
+
+@inner
+def timed_from(world: World) -> None:
+    """The controller's update begins."""
+    world.counts[STARTED_NS] = now_ns(world.timespec)
+
+
+@inner
+def timed_to(world: World) -> None:
+    """The controller's update ends."""
+    world.counts[TOOK_NS] = now_ns(world.timespec) - world.counts[STARTED_NS]
+
+
+@inner
+def begin_tick(world: World, k: int) -> bool:
+    """Wait for tick k, read sensors and reference; False where real time has passed all of it."""
+    n, plant = world.tau.size, world.plant
+    i = k - world.counts[CHUNK_START]
+    for j in range(n):
+        world.x[j], world.x[n + j] = plant.q[j], plant.qd[j]
+        world.x_ref[j], world.x_ref[n + j] = world.q_ref[i, j], world.qd_ref[i, j]
+        world.xd_ref[j], world.xd_ref[n + j] = world.qd_ref[i, j], world.qdd_ref[i, j]
+    for j in range(2 * n):
+        world.e_track[j] = world.x[j] - world.x_ref[j]
+    world.counts[TOOK_NS] = 0
+    world.late_ns[0] = 0
+    in_time = world.pace.period_ns == 0 or _wait(world, k)
+    world.counts[CONTROLLED] = 1 if in_time else 0
+    return in_time
+
+
+@inner
+def _wait(world: World, k: int) -> bool:
+    """Wait for the wall-clock time of tick k; whether there is still time to control it."""
+    period = world.pace.period_ns
+    due = world.counts[START_NS] + k * period
+    now = now_ns(world.timespec)
+    if now < due:
+        now = sleep_until(due, world.timespec)
+    world.late_ns[0] = now - due
+    return bool(now < due + period)
+
+
+@inner
+def end_tick(world: World, command: Command, k: int) -> bool:
+    """Apply the command, record tick k and step the arm; True where the run must end."""
+    missed = world.pace.period_ns > 0 and _too_late(world, k)
+    wanted = _watchdog(world) if missed else command.tau
+    saturated = actuate(world.actuators, wanted)
+    tau = world.actuators.tau
+    largest = 0.0
+    for j in range(tau.size):
+        largest = max(largest, abs(tau[j]))
+        if not math.isfinite(tau[j]):
+            world.counts[STATUS] = TAU_NOT_FINITE
+            return True
+    if largest > MUJOCO_ZEROES_ABOVE:
+        world.counts[STATUS] = TAU_TOO_LARGE
+        return True
+    forward(world.plant, tau)
+    if k > 0:
+        _end_period(world, tau)
+    _true_dynamics(world, command, tau, saturated or missed)
+    row = world.rows[world.counts[ROWS]]
+    fill(world, command, k, saturated, missed, row)
+    for value in row:
+        if not math.isfinite(value):
+            world.counts[STATUS] = ROW_NOT_FINITE
+            return True
+    world.counts[ROWS] += 1
+    for j in range(world.x.size):
+        if max(abs(world.x[j]), abs(command.x_hat[j])) > DIVERGED_ABOVE:
+            world.counts[STATUS] = OUT_OF_RANGE
+            return True
+    begin_period(world.bounds, world.f_err, world.plant.qacc)
+    copy(tau, world.tau)
+    integrate(world.plant)
+    return False
+
+
+@inner
+def _too_late(world: World, k: int) -> bool:
+    """Whether tick k has no command in time; the hangs that a scenario asks for happen here."""
+    pace = world.pace
+    if world.counts[CONTROLLED] == 0:
+        return True
+    for stall in pace.stalls:
+        if stall[0] == k:
+            sleep_until(now_ns(world.timespec) + stall[1], world.timespec)
+            world.counts[TOOK_NS] += stall[1]
+    due = world.counts[START_NS] + k * pace.period_ns
+    return bool(now_ns(world.timespec) > due + pace.period_ns)
+
+
+@inner
+def _watchdog(world: World) -> Array:
+    """The torque (n,) N·m that acts where none was commanded in time."""
+    n, tau = world.tau.size, world.qdd
+    for j in range(n):
+        if world.pace.watchdog == HOLD:
+            tau[j] = world.tau[j]
+        elif world.pace.watchdog == ZERO:
+            tau[j] = 0.0
+        else:
+            tau[j] = -world.pace.damping * world.x[n + j]
+    return tau
+
+
+@inner
+def _end_period(world: World, tau: Array) -> None:
+    """The period before tick k ended with q̈ under the torque that was held until now."""
+    n = tau.size
+    change = world.f_true[:n]
+    for j in range(n):
+        change[j] = world.tau[j] - tau[j]
+    solve_inertia(world.plant, change, world.qdd)
+    for j in range(n):
+        world.qdd[j] += world.plant.qacc[j]
+    end_period(world.bounds, world.e_track, world.qdd, world.xd_ref[n:])
+
+
+@inner
+def _true_dynamics(world: World, command: Command, tau: Array, substituted: bool) -> None:
+    """f_true = Ẋ − B τ, and what the closed loop feels of it, f_err = Ẋ − B τ_cmd − f̂."""
+    n = tau.size
+    for j in range(n):
+        world.f_true[j], world.f_true[n + j] = world.x[n + j], world.plant.qacc[j]
+    for j in range(2 * n):
+        world.f_err[j] = world.f_true[j] - command.Bu[j] - command.f_hat[j]
+    if substituted:
+        solve_spd(command.B2_inv, tau, world.qdd, world.L)
+        for j in range(n):
+            world.f_true[n + j] -= world.qdd[j]
+    else:
+        for j in range(2 * n):
+            world.f_true[j] -= command.Bu[j]
+
+
+@inner
+def fill(world: World, command: Command, k: int, saturated: bool, missed: bool, row: Array) -> None:
+    """Tick k as a row, in the order of `StepLayout.widths`."""
+    n, monitors = world.tau.size, command.monitors
+    row[0] = k * world.dt
+    at = 1
+    at = _put(row, at, world.x)
+    at = _put(row, at, world.x)  # the sensors are perfect
+    at = _put(row, at, world.x_ref)
+    at = _put(row, at, command.tau)
+    at = _put(row, at, world.actuators.tau)
+    at = _put(row, at, command.x_hat)
+    at = _put(row, at, command.f_hat)
+    at = _put(row, at, world.f_true)
+    at = _put(row, at, command.e_obs)
+    at = _put(row, at, monitors.weight_norm)
+    at = _put(row, at, monitors.update_ratio)
+    at = _put(row, at, monitors.eta_bound)
+    at = _put(row, at, monitors.gradient_change)
+    at = _put(row, at, monitors.drt_bound)
+    lyapunov = 0.0
+    for j in range(2 * n):
+        lyapunov += world.e_track[j] ** 2
+    row[at] = lyapunov
+    row[at + 1] = world.bounds.joint[0]
+    row[at + 2] = world.bounds.paper[0]
+    row[at + 3] = world.counts[TOOK_NS] * 1e-3
+    row[at + 4] = 1.0 if saturated else 0.0
+    row[at + 5] = monitors.clipped[0]
+    row[at + 6] = 1.0 if missed else 0.0
+    row[at + 7] = world.late_ns[0] * 1e-3
+
+
+@compiled
+def _put(row: Array, at: int, values: Array) -> int:
+    """Copy values into a row from `at` on; where the next ones go."""
+    for j in range(values.size):
+        row[at + j] = values[j]
+    return at + values.size
