@@ -8,8 +8,8 @@ import numpy as np
 
 from dnnmso_mj.dynamics import Links, TwoLink
 from dnnmso_mj.errors import ScenarioError
-from dnnmso_mj.plant import Mjcf, NominalModel, Plant
-from dnnmso_mj.scenario import DnnMso, Initial, Scenario, Sinusoid
+from dnnmso_mj.plant import Mjcf, NominalModel, Plant, build_spec, compile_spec
+from dnnmso_mj.scenario import PAPER_MODEL, DnnMso, Initial, Scenario, Sinusoid
 from dnnmso_mj.scenario import Plant as PlantSpec
 
 Array = np.ndarray
@@ -37,7 +37,9 @@ class DynamicsCheck:
         return all(error <= TOLERANCE for error in self.errors.values())
 
 
-def check_dynamics(mjcf: Mjcf, links: Links, n_states: int, seed: int = 0) -> DynamicsCheck:
+def check_dynamics(
+    mjcf: Mjcf, links: Links, n_states: int, seed: int = 0, name: str = PAPER_MODEL
+) -> DynamicsCheck:
     """Compare over `n_states` random states of random arms, a new arm every 100 states.
 
     Masses 0.1 to 10 kg, lengths 0.2 to 2 m, gravity 0 to 20 m/s², any angle, velocities and
@@ -48,18 +50,34 @@ def check_dynamics(mjcf: Mjcf, links: Links, n_states: int, seed: int = 0) -> Dy
         links: which analytic model.
         n_states: how many states.
         seed: of the draws.
+        name: what messages call the model.
 
     Raises:
-        ScenarioError: the model does not have two links.
+        ScenarioError: the model cannot be used, or is not a two-link arm.
     """
+    _refuse_other_arms(mjcf, name)
     rng = np.random.default_rng(seed)
     worst = dict.fromkeys(QUANTITIES, 0.0)
     n_arms = -(-n_states // STATES_PER_ARM)
     for arm in range(n_arms):
         count = min(STATES_PER_ARM, n_states - arm * STATES_PER_ARM)
-        for name, error in _compare_arm(mjcf, links, count, rng).items():
-            worst[name] = float(np.fmax(worst[name], error) if np.isfinite(error) else np.inf)
+        for quantity, error in _compare_arm(mjcf, links, count, rng).items():
+            worst[quantity] = float(
+                np.fmax(worst[quantity], error) if np.isfinite(error) else np.inf
+            )
     return DynamicsCheck(links, n_states, n_arms, worst)
+
+
+def _refuse_other_arms(mjcf: Mjcf, name: str) -> None:
+    """Before masses and lengths are set on it: an arm of two joints and two bodies."""
+    as_it_is = PlantSpec(model=name, masses=None, lengths=None)
+    model = compile_spec(build_spec(as_it_is, 1e-3, mjcf), name)
+    bodies, joints = model.nbody - 1, model.njnt
+    if (bodies, joints) != (2, 2):
+        raise ScenarioError(
+            f"plant.model = {name}: {bodies} bodies and {joints} joints; allowed: 2 and 2, since "
+            "the formula is that of a two-link arm"
+        )
 
 
 def _compare_arm(
@@ -100,11 +118,6 @@ def _from_mujoco(
 ) -> dict[str, Array]:
     """M, V, G and q̈ by the very objects that a run uses."""
     plant, model = Plant(scenario, mjcf), NominalModel(scenario, mjcf)
-    if plant.model.nbody != 3:
-        raise ScenarioError(
-            f"the model has {plant.model.nbody - 1} bodies; allowed: 2, since the analytic "
-            "dynamics are those of a two-link arm"
-        )
     rest = np.zeros(2)
     out: dict[str, list[Array]] = {name: [] for name in QUANTITIES}
     for q_k, qd_k, tau_k in zip(q, qd, tau, strict=True):

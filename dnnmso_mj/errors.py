@@ -1,5 +1,7 @@
 """The errors that reach a person: each names the culprit, its value and what is allowed."""
 
+from pathlib import Path
+
 
 class DnnmsoError(Exception):
     """Root of every error this package raises on purpose. The command line exits with status 2."""
@@ -15,6 +17,15 @@ class LogError(DnnmsoError):
 
 class MissingExtraError(DnnmsoError):
     """An optional part of the package that is not installed."""
+
+
+class RunInterrupted(KeyboardInterrupt):
+    """Ctrl-C during a logged run; the log is whole and holds the run's first `ticks`."""
+
+    def __init__(self, log: Path, ticks: int) -> None:
+        super().__init__(f"log: {log} ({ticks} ticks)")
+        self.log = log
+        self.ticks = ticks
 
 
 class NonFiniteError(DnnmsoError):

@@ -1,7 +1,8 @@
 """The typed scenario: everything that decides a run, with units, ranges and the paper's values.
 
-Loading a file with line numbers and messages for people is `dnnmso_mj.loading`'s work; this module
-holds only the shapes and the rules that tie one value to another.
+This module holds the shapes, and the rules within one of them; those that tie one to another are in
+`dnnmso_mj.consistency`. Loading a file with line numbers and messages for people is
+`dnnmso_mj.loading`'s work.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-MAX_TICKS = 100_000_000
+from dnnmso_mj.consistency import contradictions, entries
+
 MAX_WEIGHTS = 10_000_000
+PAPER_MODEL = "two_link"
 
 
 def _refusal(*problems: tuple[str, str]) -> PydanticCustomError:
@@ -38,10 +41,6 @@ def _vector(value: Any) -> Any:
     return (value,) if is_number else _tuple(value)
 
 
-def _entries(count: int) -> str:
-    return "1 entry" if count == 1 else f"{count} entries"
-
-
 def _number_or_list(item: dict[str, Any]) -> WithJsonSchema:
     return WithJsonSchema({"anyOf": [item, {"type": "array", "items": item, "minItems": 1}]})
 
@@ -49,6 +48,8 @@ def _number_or_list(item: dict[str, Any]) -> WithJsonSchema:
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+# Beyond these, sums of squares of weights or gradients leave the range of floating point.
+WeightScale = Annotated[float, Field(ge=1e-3, le=1e3, allow_inf_nan=False)]
 # The length stands before the conversion, or the JSON Schema would say minLength for minItems.
 Vector = Annotated[tuple[Finite, ...], Field(min_length=1), BeforeValidator(_tuple)]
 Positives = Annotated[tuple[Positive, ...], Field(min_length=1), BeforeValidator(_tuple)]
@@ -90,18 +91,26 @@ class Strict(BaseModel):
 class Plant(Strict):
     """The robot that MuJoCo steps."""
 
-    model: str = "two_link"
+    model: str = PAPER_MODEL
     """MJCF: the name of a shipped model, or a path relative to the scenario file."""
     links: Literal["point_mass", "rod"] = "point_mass"
     """Mass of each link: a point at its tip, or a uniform thin rod."""
     masses: Positives | None = (1.0, 2.3)
-    """Link masses (kg); null keeps what the MJCF says."""
+    """Link masses (kg); null, the default of any model but two_link: what the MJCF says."""
     lengths: Positives | None = (1.0, 1.0)
-    """Link lengths (m); null keeps what the MJCF says."""
+    """Link lengths (m); null, the default of any model but two_link: what the MJCF says."""
     gravity: NonNegative = 9.81
     """Gravitational acceleration, along -z (m/s²)."""
     integrator: Literal["rk4", "euler", "implicitfast"] = "rk4"
     """MuJoCo's integrator."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _own_links(cls, data: Any) -> Any:
+        """The paper's masses and lengths are those of the paper's arm, and of no other model."""
+        if isinstance(data, dict) and data.get("model", PAPER_MODEL) != PAPER_MODEL:
+            return {"masses": None, "lengths": None, **data}
+        return data
 
     @model_validator(mode="after")
     def _same_links(self) -> Plant:
@@ -109,7 +118,7 @@ class Plant(Strict):
             given = "masses" if self.lengths is None else "lengths"
             raise _refusal((given, "stands alone; allowed: masses and lengths both, or both null"))
         if self.masses and self.lengths and len(self.masses) != len(self.lengths):
-            found, allowed = _entries(len(self.lengths)), len(self.masses)
+            found, allowed = entries(len(self.lengths)), len(self.masses)
             raise _refusal(("lengths", f"has {found}; allowed: {allowed}, as many as masses"))
         return self
 
@@ -166,7 +175,7 @@ class Waypoints(Strict):
     @model_validator(mode="after")
     def _ordered(self) -> Waypoints:
         if len(self.times) != len(self.points):
-            found, allowed = _entries(len(self.times)), len(self.points)
+            found, allowed = entries(len(self.times)), len(self.points)
             raise _refusal(("times", f"has {found}; allowed: {allowed}, one for each of points"))
         late = [k for k in range(1, len(self.times)) if self.times[k] <= self.times[k - 1]]
         if late:
@@ -193,16 +202,16 @@ class Network(Strict):
     """full: all 2n rows are learned (paper). kinematic: the upper n rows are the measured q̇."""
     bias: bool = True
     """Whether each layer sees a constant 1 beside its inputs."""
-    init_scale: Positive | None = None
+    init_scale: WeightScale | None = None
     """Kumar's constant: spread = init_scale/√fan_in. null: the activation's own (sigmoid 3.6)."""
     init_spread: Literal["standard_deviation", "variance"] = "standard_deviation"
     """Whether init_scale/√fan_in is a standard deviation or a variance; the paper does not say."""
-    output_scale: Positive = 1.0
+    output_scale: WeightScale = 1.0
     """Factor on the initial weights of the output layer."""
     backend: Literal["kernel", "torch"] = "kernel"
     """kernel: compiled (fast). torch: the reference that the kernel is tested against (slow)."""
-    precision: Literal["float64", "float32"] = "float64"
-    """Arithmetic of the kernel; float32 is faster. The torch reference is always float64."""
+    precision: Literal["float64", "float32"] = "float32"
+    """Arithmetic of the network: float32, torch's own default, takes half the time of float64."""
 
     @model_validator(mode="after")
     def _fits_in_memory(self) -> Network:
@@ -220,7 +229,7 @@ class Madam(Strict):
     """Learning rate η."""
     eta_max: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.1
     """η*, the largest exponent of one update; the paper's 100 η."""
-    sigma_max: Positive = 1250.0
+    sigma_max: Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)] = 1250.0
     """σ*, the largest magnitude of a weight."""
     beta: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.999
     """β, the forgetting factor of the second moment."""
@@ -233,6 +242,19 @@ class Madam(Strict):
             problem = f"is below eta = {self.eta}; allowed: eta_max >= eta"
             raise _refusal(("eta_max", problem))
         return self
+
+
+def _resolvable(madam: Madam, network: Network) -> None:
+    """Refuse learning whose smallest steps are rounded away in the network's arithmetic."""
+    eps = float(np.finfo(network.precision).eps)
+    least = f"2^{round(np.log2(eps))} = {eps:.2g}, what {network.precision} resolves"
+    if madam.eta < eps:
+        raise _refusal(
+            ("madam.eta", f"would leave every weight as it is; allowed: {least}, or more")
+        )
+    if 1 - madam.beta < eps:
+        problem = f"would never take in a gradient; allowed: 1 - beta of {least}, or more"
+        raise _refusal(("madam.beta", problem))
 
 
 class Observer(Strict):
@@ -308,6 +330,11 @@ class DnnMso(Strict):
     madam: Madam = Madam()
     """The weight update."""
 
+    @model_validator(mode="after")
+    def _learns(self) -> DnnMso:
+        _resolvable(self.madam, self.network)
+        return self
+
 
 class NoNetwork(Strict):
     """The paper's controller with the network off: inversion and feedback alone."""
@@ -344,6 +371,7 @@ class ClassicalMso(Strict):
         if self.network.outputs != "full":
             problem = "has no meaning for classical_mso, which learns a torque; allowed: full"
             raise _refusal(("network.outputs", problem))
+        _resolvable(self.madam, self.network)
         return self
 
 
@@ -392,61 +420,8 @@ class Scenario(Strict):
         return round(self.duration / self.dt)
 
     @model_validator(mode="after")
-    def _whole_steps(self) -> Scenario:
-        steps = self.duration / self.dt
-        if not 0.5 < steps <= MAX_TICKS or abs(steps - round(steps)) > 1e-6:
-            allowed = f"allowed: a whole number of steps from 1 to {MAX_TICKS}"
-            raise _refusal(("duration", f"is {steps:.10g} steps of dt = {self.dt}; {allowed}"))
+    def _agrees(self) -> Scenario:
+        problems = contradictions(self)
+        if problems:
+            raise _refusal(*problems)
         return self
-
-    @model_validator(mode="after")
-    def _observer_is_stable(self) -> Scenario:
-        most, gain = 2.0 / self.dt, max(self.controller.observer.K2)
-        if gain >= most:
-            problem = f"makes a sampled observer unstable; allowed: K2 < 2/dt = {most:g}"
-            raise _refusal(("controller.observer.K2", problem))
-        return self
-
-    @model_validator(mode="after")
-    def _lengths(self) -> Scenario:
-        n = self.n_joints
-        wrong = []
-        for path, found, allowed in self._vector_lengths(n):
-            if found not in allowed:
-                choices = " or ".join(map(str, sorted(allowed)))
-                reason = f"since initial.q has {_entries(n)}"
-                wrong.append((path, f"has {_entries(found)}; allowed: {choices}, {reason}"))
-        if wrong:
-            raise _refusal(*wrong)
-        return self
-
-    def _vector_lengths(self, n: int) -> list[tuple[str, int, set[int]]]:
-        """Every vector: its key path, its length and the lengths allowed."""
-        out: list[tuple[str, int, set[int]]] = [("initial.qd", len(self.initial.qd), {1, n})]
-        if self.plant.masses:
-            out.append(("plant.masses", len(self.plant.masses), {n}))
-        match self.reference:
-            case Sinusoid() as ref:
-                for name in ("amplitude", "frequency", "phase", "offset"):
-                    out.append((f"reference.{name}", len(getattr(ref, name)), {1, n}))
-            case Setpoint() as ref:
-                out.append(("reference.start", len(ref.start), {n}))
-                out.append(("reference.goal", len(ref.goal), {n}))
-            case Waypoints() as ref:
-                for k, point in enumerate(ref.points):
-                    out.append((f"reference.points.{k}", len(point), {n}))
-        inversion = self.controller.inversion
-        out.append(("controller.inversion.K", len(inversion.K), {1, 2 * n}))
-        if inversion.slack_matrix:
-            path = "controller.inversion.slack_matrix"
-            out.append((path, len(inversion.slack_matrix), {2 * n}))
-        if isinstance(inversion.effectiveness, Inertia):
-            for name in ("masses", "lengths"):
-                values = getattr(inversion.effectiveness, name)
-                if values:
-                    out.append((f"controller.inversion.effectiveness.{name}", len(values), {n}))
-        out.append(("controller.observer.K2", len(self.controller.observer.K2), {1, 2 * n}))
-        if self.imperfections.torque_limit:
-            path = "imperfections.torque_limit"
-            out.append((path, len(self.imperfections.torque_limit), {1, n}))
-        return out

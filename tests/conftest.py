@@ -8,12 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from dnnmso_mj.learner import warm_up
+from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.simulate import simulate
 
 ROOT = Path(__file__).parents[1]
 
@@ -27,9 +27,10 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def compiled_kernel() -> None:
+def compiled_loop() -> None:
     """Compile once, so that no test of a command line sees the notice that it does."""
-    warm_up(np.dtype(np.float64))
+    for name in ("paper", "paper_no_network", "classical_mso"):
+        simulate(load_scenario(name, ["duration=0.01"]))
 
 
 @pytest.fixture(scope="session")
@@ -41,8 +42,9 @@ def two_link() -> Mjcf:
 def make_scenario() -> Callable[..., Scenario]:
     """A paper scenario with some parts replaced: make_scenario({"kind": ...}, duration=1.0)."""
 
-    def make(controller: dict[str, Any] | None = None, **parts: Any) -> Scenario:
-        parts.setdefault("reference", {"kind": "sinusoid", "phase": [0.0, math.pi / 2]})
-        return Scenario(name="test", controller=controller or {"kind": "dnn_mso"}, **parts)
+    return _scenario
 
-    return make
+
+def _scenario(controller: dict[str, Any] | None = None, **parts: Any) -> Scenario:
+    parts.setdefault("reference", {"kind": "sinusoid", "phase": [0.0, math.pi / 2]})
+    return Scenario(name="test", controller=controller or {"kind": "dnn_mso"}, **parts)

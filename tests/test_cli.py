@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,26 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from trace_samples import METRICS
 
 from dnnmso_mj.loading import list_scenarios
 from dnnmso_mj.reading import read_trace
 
 ROOT = Path(__file__).parents[1]
 DNNMSO = Path(sys.executable).with_name("dnnmso")
-METRICS = {
-    "rmse",
-    "rmse_steady",
-    "max_abs_error_steady",
-    "tau_peak",
-    "tau_chatter",
-    "f_err_rms_steady",
-    "settling_time",
-    "bound_violations",
-    "diverged",
-    "compute_us_p50",
-    "compute_us_p999",
-    "deadline_misses",
-}
 
 
 def dnnmso(*args: object, cwd: Path, **options) -> subprocess.CompletedProcess[str]:
@@ -68,7 +56,7 @@ def test_only_the_first_run_of_all_compiles_and_says_so(tmp_path):
     args = ("run", "paper", "--set", "duration=0.05", "--no-plot", "--json")
     first, second = (dnnmso(*args, cwd=tmp_path, env=cache) for _ in range(2))
     assert first.returncode == second.returncode == 0
-    assert first.stderr == "compiling the network kernel; later runs load it\n"
+    assert first.stderr == "compiling the control loop; later runs load it\n"
     assert second.stderr == ""
     assert json.loads(first.stdout)["metrics"]["compute_us_p999"] < 100_000  # not in any tick
 
@@ -146,6 +134,7 @@ REFUSALS = [
     (("run", "paper", "--set", "plant.masses=[1,2,3]"), "plant.lengths"),
     (("run", "paper", "--set", "plant.model=three_link"), "two_link"),
     (("run", "paper", "--set", "nonsense"), "nonsense"),
+    (("run", "paper", "--set", "controller=no_network"), "controller.kind=no_network"),
     (("run", "paper", "--seed", "-1"), "seed"),
     (("run", "paper", "--set", "duration=0.01", "--out", "/proc/no/x.mcap"), "/proc/no/x.mcap"),
     (("info", "nothing.mcap"), "nothing.mcap"),
@@ -191,7 +180,7 @@ def test_a_torque_limit_that_cannot_hold_the_arm_warns_and_runs(tmp_path):
     assert "54.9" in done.stderr
 
 
-def test_check_passes_on_the_shipped_arm_and_fails_on_a_damped_one(tmp_path):
+def test_check_passes_on_the_shipped_arm_and_fails_on_a_geared_one(tmp_path):
     good = dnnmso("check", "--states", 500, "--json", cwd=tmp_path)
     document = json.loads(good.stdout)
     assert good.returncode == 0
@@ -199,9 +188,11 @@ def test_check_passes_on_the_shipped_arm_and_fails_on_a_damped_one(tmp_path):
     for errors in document["max_relative_error"].values():
         assert set(errors) == {"M", "V", "G", "qdd"}
         assert max(errors.values()) <= 1e-10
-    damped = (ROOT / "models" / "two_link.xml").read_text().replace('damping="0"', 'damping="0.1"')
-    (tmp_path / "damped.xml").write_text(damped)
-    bad = dnnmso("check", "--states", 500, "--model", "damped.xml", cwd=tmp_path)
+    geared = (
+        (ROOT / "models" / "two_link.xml").read_text().replace('armature="0"', 'armature="0.1"')
+    )
+    (tmp_path / "geared.xml").write_text(geared)
+    bad = dnnmso("check", "--states", 500, "--model", "geared.xml", cwd=tmp_path)
     assert bad.returncode == 1
     assert "FAILED" in bad.stdout
 
@@ -252,22 +243,157 @@ def test_schema_and_scenarios_are_listed(tmp_path):
 
 
 def test_help_and_version_answer(tmp_path):
-    assert "replay" in dnnmso("--help", cwd=tmp_path).stdout
+    for command in ([str(DNNMSO)], [sys.executable, "-m", "dnnmso_mj"]):
+        shown = subprocess.check_output([*command, "--help"], cwd=tmp_path, text=True)
+        assert "replay" in shown
     assert dnnmso("--version", cwd=tmp_path).stdout.count(".") == 2
 
 
-def test_ctrl_c_ends_a_run_with_its_log_whole(tmp_path):
-    command = [str(DNNMSO), "run", "paper", "--set", "duration=600", "--out", "long.mcap"]
-    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
-    log = tmp_path / "long.mcap"
-    wait_until(lambda: log.exists() and log.stat().st_size > 1_000_000)
-    process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
+def test_ctrl_c_ends_a_run_with_its_log_whole_and_says_where_it_is(tmp_path):
+    args = ("run", "paper", "--set", "duration=600", "--out", "long.mcap")
+    process = started(*args, cwd=tmp_path, stderr=subprocess.PIPE)
+    try:
+        log = tmp_path / "long.mcap"
+        wait_until(lambda: log.exists() and log.stat().st_size > 1_000_000)
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert process.returncode == 130
-    assert "Traceback" not in stderr
     trace = read_trace(log)
     assert trace.info.status == "interrupted"
     assert len(trace) > 100
+    ran = f"{len(trace) * 0.001:g} s of 600 s"
+    assert stderr == f"interrupted; log: long.mcap ({ran})\n"
+
+
+def test_ctrl_c_outside_a_run_is_told_too(tmp_path):
+    parent, child = pty.openpty()
+    process = started("check", "--states", 100_000_000, cwd=tmp_path, stderr=child)
+    os.close(child)
+    try:
+        read_until(parent, b"comparing")
+        process.send_signal(signal.SIGINT)
+        read_until(parent, b"interrupted")
+        assert process.wait(timeout=60) == 130
+    finally:
+        process.kill()
+
+
+def started(*args: object, cwd: Path, stderr: int) -> subprocess.Popen[str]:
+    """A command that listens to Ctrl-C, as one that a background shell starts does not."""
+    listening = "import os, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{listening}; os.execv(sys.argv[1], sys.argv[1:])"]
+    command += [str(DNNMSO), *map(str, args)]
+    return subprocess.Popen(command, cwd=cwd, stderr=stderr, text=True)
+
+
+def read_until(terminal: int, word: bytes) -> None:
+    shown = b""
+    while word not in shown:
+        shown += os.read(terminal, 65536)  # fails where the process ends without the word
+
+
+@pytest.mark.parametrize("args", [("schema",), ("scenarios",), ("scenarios", "--json")])
+def test_a_full_output_is_one_line_and_status_2(tmp_path, args):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [str(DNNMSO), *args],
+            cwd=tmp_path,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert done.stderr == ("error: standard output cannot be written: No space left on device\n")
+
+
+def test_an_output_that_knows_only_ascii_gets_what_it_knows(tmp_path):
+    ascii_only = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    args = ("run", "paper", "--set", "duration=0.05", "--no-plot")
+    done = dnnmso(*args, cwd=tmp_path, env=ascii_only)
+    assert done.returncode == 0, done.stderr
+    assert "N?m" in done.stdout
+    assert done.stdout.isascii()
+
+
+def test_no_place_for_compiled_code_says_what_to_set(tmp_path):
+    """Files and /proc, where folders should be, stand for those that cannot be written."""
+    package = tmp_path / "dnnmso_mj"
+    shutil.copytree(ROOT / "dnnmso_mj", package, ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in [package, *(path for path in package.rglob("*") if path.is_dir())]:
+        (folder / "__pycache__").write_text("")
+    for name in ("models", "scenarios"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    kept = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    nowhere = {"HOME": "/proc/none", "XDG_CACHE_HOME": "/proc/none", "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-m", "dnnmso_mj", "run", "paper", "--set", "duration=0.05"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=kept | nowhere, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: no folder where numba may keep compiled code")
+    assert "NUMBA_CACHE_DIR" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_what_mujoco_warns_of_is_told_and_leaves_no_file_behind(tmp_path):
+    heavy = ("plant.gravity=1e12", "plant.integrator=euler", "duration=0.05")
+    sets = [word for item in heavy for word in ("--set", item)]
+    done = dnnmso("run", "paper_no_network", *sets, "--no-plot", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "diverged: " in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["logs"]
+
+
+def test_a_model_that_does_not_fit_is_told_with_file_line_and_key(tmp_path):
+    model = (ROOT / "models" / "two_link.xml").read_text()
+    (tmp_path / "mine.xml").write_text(model.replace('damping="0"', 'damping="1"'))
+    text = (ROOT / "scenarios" / "paper.yaml").read_text()
+    (tmp_path / "mine.yaml").write_text(text.replace("model: two_link", "model: mine.xml"))
+    line = next(k for k, row in enumerate(text.splitlines(), 1) if "model: two_link" in row)
+    done = dnnmso("run", "mine.yaml", cwd=tmp_path)
+    assert done.returncode == 2
+    assert f"error: mine.yaml:{line}: plant.model = " in done.stderr
+    assert "joint 'joint1' has damping" in done.stderr
+    done = dnnmso("run", "paper", "--set", "plant.model=mine.xml", cwd=tmp_path)
+    assert "error: --set plant.model=mine.xml: plant.model = " in done.stderr
+    sets = ("initial.q=[0, 0, 0]", "plant.masses=null", "plant.lengths=null")
+    sets += ("reference.phase=0",)
+    words = [word for item in sets for word in ("--set", item)]
+    done = dnnmso("run", "paper", *words, cwd=tmp_path)
+    assert "error: --set initial.q=[0, 0, 0]: initial.q has 3 entries" in done.stderr
+    assert not (tmp_path / "logs").exists()
+
+
+def test_check_names_the_model_that_it_was_given(tmp_path):
+    model = (ROOT / "models" / "two_link.xml").read_text()
+    hand = '<body name="hand"><geom size="0.1"/></body><site name="tip"'
+    (tmp_path / "arm3.xml").write_text(model.replace('<site name="tip"', hand))
+    done = dnnmso("check", "--model", "arm3.xml", "--states", 1, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: --model arm3.xml: 3 bodies and 2 joints; allowed: 2")
+    (tmp_path / "torn.xml").write_text(model[:500])
+    done = dnnmso("check", "--model", "torn.xml", "--states", 1, cwd=tmp_path)
+    assert done.stderr.startswith("error: --model torn.xml: MuJoCo says")
+
+
+def test_logs_that_cannot_be_compared_leave_no_figures(tmp_path, short_log):
+    one = """<mujoco><worldbody><body name="link1"><joint name="j" axis="0 -1 0"/>
+      <geom size="0.1" mass="1" contype="0" pos="1 0 0"/></body></worldbody>
+      <actuator><motor joint="j"/></actuator></mujoco>"""
+    (tmp_path / "one.xml").write_text(one)
+    (tmp_path / "one.yaml").write_text(
+        "name: one\nduration: 0.1\nplant: {model: one.xml}\ninitial: {q: [0]}\n"
+        "reference: {kind: sinusoid}\ncontroller: {kind: no_network}\n"
+    )
+    done = dnnmso("run", "one.yaml", "--no-plot", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = dnnmso("plot", short_log, "logs/one.mcap", "--out", "figures", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "runs with [1, 2] joints cannot be compared" in done.stderr
+    assert list(tmp_path.rglob("*.png")) == []
 
 
 def test_progress_bar_shows_on_a_terminal_only(tmp_path):

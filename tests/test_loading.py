@@ -15,9 +15,11 @@ from hypothesis import strategies as st
 
 from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import ScenarioError
-from dnnmso_mj.loading import ScenarioWarning, load_scenario, stretched_load
+from dnnmso_mj.loading import ScenarioWarning, load_scenario
+from dnnmso_mj.loading.advice import stretched_load
 from dnnmso_mj.paths import models_dir, scenarios_dir
 from dnnmso_mj.scenario import DnnMso, NoNetwork, Plant, Scenario, Setpoint, Sinusoid
+from dnnmso_mj.simulate import simulate
 
 MINIMAL = "name: x\nreference:\n  kind: sinusoid\ncontroller:\n  kind: dnn_mso\n"  # lines 1 to 5
 PAPER = (scenarios_dir() / "paper.yaml").read_text()
@@ -95,6 +97,21 @@ def test_a_model_beside_the_scenario_is_found_later_from_anywhere(
     (folder / "arms" / "s.yaml").write_text(MINIMAL + "plant: {model: mine.xml}\n")
     monkeypatch.chdir("/")
     assert load_scenario(folder / "arms" / "s.yaml").plant.model == str(arm)
+
+
+@pytest.mark.parametrize("rest", ["", "plant: {gravity: 1}\n"])
+def test_a_model_of_ones_own_does_not_get_the_papers_masses(folder: Path, rest: str) -> None:
+    (folder / "arm.xml").write_text("<mujoco/>")
+    for scenario in (
+        load(MINIMAL + "plant: {model: arm.xml}\n"),
+        load(MINIMAL + rest, "plant.model=arm.xml"),
+    ):
+        assert (scenario.plant.masses, scenario.plant.lengths) == (None, None)
+    given = load(MINIMAL + "plant: {model: arm.xml, masses: [1, 2], lengths: [3, 4]}\n")
+    assert (given.plant.masses, given.plant.lengths) == ((1.0, 2.0), (3.0, 4.0))
+    text = MINIMAL + "plant: {model: arm.xml, masses: [1, 2]}\n"
+    with pytest.raises(ScenarioError, match=r"s\.yaml:6: plant\.masses = \[1, 2\]: stands alone"):
+        load(text)
 
 
 def test_a_model_in_an_override_is_relative_to_the_current_folder(folder: Path) -> None:
@@ -313,6 +330,20 @@ def test_waypoint_times_must_increase() -> None:
     assert "reference.times = [0, 2]: has 2 entries; allowed: 3" in refusal(
         text.replace("  - 2\n  - 2\n", "  - 2\n")
     )
+
+
+def test_motions_within_less_than_a_step_are_refused() -> None:
+    text = (
+        "name: x\ncontroller: {kind: dnn_mso}\nreference:\n  kind: waypoints\n"
+        "  times: [0, 1e-300, 1]\n  points: [[0, 0], [1, 1], [0, 0]]\n"
+    )
+    assert refusal(text) == (
+        "s.yaml:5: reference.times.1 = 1e-300: comes 1e-300 s after the time before, less than "
+        "one step; allowed: dt = 0.001 or more"
+    )
+    simulate(load(text, "reference.times=[0, 0.001, 1]", "duration=0.05"))
+    blend = "reference={kind: setpoint, start: [0, 0], goal: [1, 1], blend_time: 1e-300}"
+    assert "reference.blend_time = 1e-300: is less than one step" in refusal(MINIMAL, blend)
 
 
 def test_thousands_of_faults_are_cut_short() -> None:
@@ -552,6 +583,33 @@ def test_nothing_is_said_where_the_limit_suffices_or_the_masses_are_unknown() ->
     assert messages("plant.gravity=0", "imperfections.torque_limit=1") == []
     unknown = ("plant.masses=null", "plant.lengths=null", "imperfections.torque_limit=1")
     assert messages(*unknown) == []
+
+
+GAINS = [
+    (("lam=1990",), ""),
+    (("lam=1993",), "lam = 1993: makes the loop, sampled each dt, unstable even with an exact "),
+    (("K=1990",), ""),
+    (("K=1993",), "stable: K + lam < 2/dt = 2000"),
+    (("K=[3900, 3900, 7.5, 7.5]",), ""),
+    (("K=[4100, 4100, 7.5, 7.5]",), "stable: lam K dt < 2 (K + lam)"),
+    (("lam=1993", "effectiveness.kind=constant"), ""),  # b may make up for it
+]
+
+
+@pytest.mark.parametrize(("gains", "told"), GAINS)
+def test_gains_that_no_step_of_dt_can_hold_are_warned_of(gains: tuple[str], told: str) -> None:
+    found = messages(*(f"controller.inversion.{gain}" for gain in gains))
+    assert [told in message for message in found] == ([True] if told else [])
+
+
+@pytest.mark.parametrize(("lam", "stable"), [(1990, True), (1996, False)])
+def test_the_warning_of_gains_is_right(lam: int, stable: bool) -> None:
+    """K + λ = 1997.5 and 2003.5 with dt = 1 ms, without a network: just stable, just not."""
+    text = (scenarios_dir() / "paper_no_network.yaml").read_text()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        trace = simulate(load(text, f"controller.inversion.lam={lam}", "duration=2"))
+    assert (trace.info.status == "ok") == stable
 
 
 @pytest.mark.parametrize("links", ["point_mass", "rod"])

@@ -11,48 +11,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from trace_samples import DT, METRICS, trace_with
 
 from dnnmso_mj.metrics import bound_violations, compute_metrics, settling_time
-from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.trace import RunInfo, StepLayout, Trace
-
-NAMES = {
-    "rmse",
-    "rmse_steady",
-    "max_abs_error_steady",
-    "tau_peak",
-    "tau_chatter",
-    "f_err_rms_steady",
-    "settling_time",
-    "bound_violations",
-    "diverged",
-    "compute_us_p50",
-    "compute_us_p999",
-    "deadline_misses",
-}
-DT = 0.001
+from dnnmso_mj.trace import StepLayout, Trace
 
 
 def trace_of(n_ticks: int, status: str = "ok", n_joints: int = 2, **columns: Any) -> Trace:
     """A trace of zeros, but for the bound (undefined) and the columns given (broadcast)."""
     layout = StepLayout(n_joints, 3)
     rows = np.zeros((n_ticks, layout.width))
-    rows[:, layout.slices["t"]] = DT * np.arange(n_ticks)[:, None]
-    rows[:, layout.slices["ultimate_bound"]] = -1.0
-    for name, given_values in columns.items():
-        values = np.asarray(given_values, dtype=float)
-        per_tick = values.shape == (n_ticks,)
-        rows[:, layout.slices[name]] = values[:, None] if per_tick else values
-    scenario = Scenario.model_validate(
-        {
-            "name": "synthetic",
-            "initial": {"q": [0.5] * n_joints},
-            "plant": {"masses": None, "lengths": None},
-            "reference": {"kind": "sinusoid"},
-            "controller": {"kind": "dnn_mso"},
-        }
-    )
-    return Trace(layout.columns(rows), scenario, RunInfo(status=status, seed=0))
+    return trace_with(rows, layout, {"ultimate_bound": -1.0} | columns, status=status)
 
 
 def halves(first: float, second: float, n_ticks: int = 1001) -> np.ndarray:
@@ -61,7 +30,7 @@ def halves(first: float, second: float, n_ticks: int = 1001) -> np.ndarray:
 
 
 def test_names_are_the_contract() -> None:
-    assert set(compute_metrics(trace_of(10))) == NAMES
+    assert set(compute_metrics(trace_of(10))) == METRICS
 
 
 def test_rmse_of_a_constant_error_is_its_size_whatever_its_sign() -> None:

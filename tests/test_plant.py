@@ -120,6 +120,8 @@ def test_dm_control_steps_the_same_model_to_the_same_state(make_scenario, two_li
             "hinges and slides",
         ),
         ('ctrllimited="false"', 'ctrlrange="-1 1"', "without ctrlrange"),
+        ('name="motor1" joint="joint1"', 'name="motor1" joint="joint2"', "order of the joints"),
+        ('name="motor1" joint="joint1"', 'name="motor1" site="tip"', "order of the joints"),
         ('name="link2"', 'name="forearm"', "no body 'link2'"),
         ("<worldbody>", "<wordbody>", "MuJoCo says"),
     ],

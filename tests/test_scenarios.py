@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 from pydantic import BaseModel
@@ -27,6 +28,7 @@ from dnnmso_mj.scenario import (
     Sinusoid,
     Waypoints,
 )
+from dnnmso_mj.simulate import simulate
 
 FILES = sorted(scenarios_dir().glob("*.yaml"))
 NAMES = [file.stem for file in FILES]
@@ -209,8 +211,47 @@ def test_the_schema_takes_one_number_or_a_list_where_the_loader_does(
     [
         ("paper", "controller.observer.K2=2000", "K2 < 2/dt = 2000"),
         ("classical_mso", "controller.network.outputs=kinematic", "allowed: full"),
+        ("paper", "controller.madam.sigma_max=1e-300", "from 0.001 to 1000000"),
+        ("paper", "controller.network.init_scale=1e-300", "from 0.001 to 1000"),
+        ("paper", "controller.network.output_scale=1e300", "from 0.001 to 1000"),
     ],
 )
 def test_values_that_cannot_work_together_are_refused(name, override, message):
     with pytest.raises(ScenarioError, match=message):
         load_scenario(name, [override])
+
+
+@pytest.mark.parametrize("name", ["paper", "classical_mso"])
+@pytest.mark.parametrize(
+    ("precision", "eta", "beta", "least"),
+    [
+        ("float64", 1e-17, 1 - 2**-53, r"2\^-52 = 2\.2e-16"),
+        ("float32", 1e-7, 1 - 1e-8, r"2\^-23 = 1\.2e-07"),
+    ],
+)
+def test_learning_that_would_be_rounded_away_is_refused(name, precision, eta, beta, least):
+    arithmetic = f"controller.network.precision={precision}"
+    for key, value in (("eta", eta), ("beta", beta)):
+        with pytest.raises(ScenarioError, match=rf"madam\.{key} .* {least}, what {precision} re"):
+            load_scenario(name, [arithmetic, f"controller.madam.{key}={value!r}"])
+        if precision == "float32":
+            fine = "controller.network.precision=float64"
+            load_scenario(name, [fine, f"controller.madam.{key}={value!r}"])
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize(
+    "extremes",
+    [
+        ("network.init_scale=1e-3", "network.output_scale=1e-3", "madam.sigma_max=1e-3"),
+        ("network.init_scale=1e-3", "network.output_scale=1e-3", "madam.eta=2e-7"),
+        ("network.init_scale=1e3", "network.output_scale=1e3", "madam.sigma_max=1e6"),
+    ],
+)
+def test_the_extremes_of_what_is_allowed_stay_numbers(precision, extremes):
+    sets = [f"controller.{item}" for item in (*extremes, f"network.precision={precision}")]
+    trace = simulate(load_scenario("paper", [*sets, "duration=0.1"]))
+    # Weights of a thousand may well drive the arm away; the learning itself must stay finite.
+    assert trace.info.status == "ok" or trace.info.reason.startswith("|")
+    assert len(trace) > 0
+    assert np.isfinite(trace["update_ratio"]).all()

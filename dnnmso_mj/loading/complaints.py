@@ -103,7 +103,10 @@ def _explain(detail: ErrorDetails, path: KeyPath, data: Any) -> list[Complaint]:
     if value is ABSENT:
         return [Complaint(path, f"{dotted(path)}: missing key; allowed: {allowed}", True)]
     choices = shape.choices if shape else ()
-    problem = f"{_what(kind, value)}; allowed: {allowed}{did_you_mean(value, choices)}"
+    hint = did_you_mean(value, choices)
+    if shape and shape.kinds and path[-1] != "kind" and value in choices:
+        hint = f"; did you mean {dotted((*path, 'kind'))}={value}?"
+    problem = f"{_what(kind, value)}; allowed: {allowed}{hint}"
     return [complain(path, data, problem)]
 
 

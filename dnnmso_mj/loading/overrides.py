@@ -94,14 +94,20 @@ def _put(data: dict[str, Any], override: Override) -> Complaint | None:
         path = (*path, part)
         if isinstance(here, dict) and part not in here:
             shape = Shape.root().at(path, data)
-            default = shape.default if shape else ABSENT
-            here[part] = {} if default is ABSENT else deepcopy(default)
+            here[part] = _begin(shape.default if shape else ABSENT)
         here = here[part]
     last = _part(here, override.path[-1])
     if last is None:
         return _lost(override, path, data)
     here[last] = override.value
     return None
+
+
+def _begin(default: Any) -> Any:
+    """A part to be filled in. Keys that are left out of a group keep their own defaults."""
+    if isinstance(default, dict):
+        return {key: value for key, value in default.items() if key == "kind"}
+    return {} if default is ABSENT else deepcopy(default)
 
 
 def _part(here: Any, key: str) -> Any:

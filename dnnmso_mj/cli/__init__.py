@@ -1,0 +1,140 @@
+"""The command `dnnmso`: every command is a few lines over the library, one file a group of them.
+
+Exit status: 0 done; 1 the run diverged or a check failed; 2 bad input; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+import warnings
+from io import TextIOWrapper
+from typing import Annotated, NoReturn
+
+import typer
+
+from dnnmso_mj import __version__
+from dnnmso_mj.cli import bench, check, logs, run, scenarios
+from dnnmso_mj.cli.shared import BAD_INPUT, INTERRUPTED
+from dnnmso_mj.errors import DnnmsoError
+
+app = typer.Typer(
+    help="Run, prove, replay and measure the DNN-MSO controller on a MuJoCo arm.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def main() -> NoReturn:
+    """Entry point: run the command line; people's errors are one message and status 2."""
+    warnings.showwarning = _Warnings().show
+    warnings.simplefilter("always", UserWarning)
+    _degrade()
+    status = _run()
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as error:
+        status = _refused_output(error)
+    sys.exit(status)
+
+
+def _run() -> int:
+    """The exit status of the command, its errors told."""
+    try:
+        app(prog_name="dnnmso")
+    except SystemExit as end:
+        if end.code == INTERRUPTED:
+            # typer turns KeyboardInterrupt into this, and says nothing.
+            cause = getattr(end.__context__, "__cause__", None)
+            print(f"interrupted; {cause}" if str(cause or "") else "interrupted", file=sys.stderr)
+        return end.code if isinstance(end.code, int) else 0
+    except DnnmsoError as error:
+        print(f"error: {error}", file=sys.stderr)
+    except OSError as error:
+        if error.filename is None and error.errno in FULL:
+            return _refused_output(error)
+        print(f"error: {error.filename or ''}: {error.strerror}", file=sys.stderr)
+    except (RuntimeError, ImportError, SystemError) as error:
+        if _interrupted(error):
+            print("interrupted", file=sys.stderr)
+            return INTERRUPTED
+        if "cannot cache function" not in str(error):
+            raise
+        print(f"error: {NO_CACHE}", file=sys.stderr)
+    return BAD_INPUT
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error: libraries make others of it while they are imported."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+
+NO_CACHE = (
+    "no folder where numba may keep compiled code: neither the package's nor the one in your home "
+    "can be written; allowed: the environment variable NUMBA_CACHE_DIR set to a folder that can be"
+)
+
+
+def _degrade() -> None:
+    """Print what an output's encoding lacks as '?', rather than fail on it."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")
+
+
+def _refused_output(error: OSError) -> int:
+    """Say so, and drop what is left, or Python would complain once more at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    if error.errno == errno.EPIPE:
+        return 1  # nobody reads on, as after `| head`
+    print(f"error: standard output cannot be written: {error.strerror}", file=sys.stderr)
+    return BAD_INPUT
+
+
+class _Warnings:
+    """Shows each of people's warnings once, as one line."""
+
+    def __init__(self) -> None:
+        self._shown: set[str] = set()
+
+    def show(
+        self, message: Warning | str, category: type[Warning], *_place: object, **_file: object
+    ) -> None:
+        if issubclass(category, UserWarning) and str(message) not in self._shown:
+            self._shown.add(str(message))
+            print(f"warning: {message}", file=sys.stderr)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    pass
+
+
+# In the order of the help.
+app.command()(run.run)
+app.command()(check.check)
+app.command()(logs.plot)
+app.command()(logs.replay)
+app.command()(logs.info)
+app.command()(logs.recover)
+app.command()(scenarios.schema)
+app.command()(scenarios.scenarios)
+app.command()(bench.bench)

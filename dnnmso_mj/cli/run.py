@@ -1,0 +1,106 @@
+"""`dnnmso run`: one scenario, its log, its figures and a summary."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dnnmso_mj.cli.shared import (
+    DIVERGED,
+    Json,
+    Overrides,
+    near,
+    number,
+    print_table,
+    progress_bar,
+    working,
+)
+from dnnmso_mj.errors import RunInterrupted, ScenarioError
+
+if TYPE_CHECKING:
+    from dnnmso_mj.trace import Trace
+
+UNITS = {
+    "rmse": "rad",
+    "rmse_steady": "rad",
+    "max_abs_error_steady": "rad",
+    "tau_peak": "N·m",
+    "tau_chatter": "N·m per step",
+    "f_err_rms_steady": "rad/s, rad/s²",
+    "settling_time": "s",
+    "bound_violations": "ticks",
+    "compute_us_p50": "µs",
+    "compute_us_p999": "µs",
+    "deadline_misses": "ticks",
+}
+
+
+def run(
+    scenario: Annotated[str, typer.Argument(help="A scenario file, or the name of a shipped one.")],
+    overrides: Overrides = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the initial weights.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The log; default logs/NAME.mcap.")] = None,
+    force: Annotated[bool, typer.Option(help="Replace an existing --out.")] = False,
+    plot: Annotated[bool, typer.Option(help="Draw the figures beside the log.")] = True,
+    as_json: Json = False,
+) -> None:
+    """Run a scenario headless: log, figures, summary."""
+    from dnnmso_mj.loading import load_scenario, located
+    from dnnmso_mj.run import run_logged
+
+    sets = [*(overrides or []), *([] if seed is None else [f"seed={seed}"])]
+    loaded = load_scenario(scenario, sets)
+    try:
+        with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
+            done = run_logged(loaded, out, force=force, progress=progress)
+    except ScenarioError as error:
+        raise located(error, scenario, sets) from error
+    except RunInterrupted as stop:
+        ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
+        raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
+    figures = []
+    if plot and len(done.trace) > 0:
+        from dnnmso_mj.plots import save_figures
+
+        with working("drawing figures"):
+            figures = save_figures(done.trace, done.log.parent, done.log.stem)
+    info = done.trace.info
+    if as_json:
+        print(json.dumps({
+            "status": info.status,
+            "reason": info.reason,
+            "scenario": loaded.name,
+            "log": str(done.log),
+            "figures": [str(figure) for figure in figures],
+            "seed": info.seed,
+            "wall_s": info.wall_s,
+            "metrics": dict(info.metrics),
+        }))  # fmt: skip
+    else:
+        _print_summary(done.trace, done.log, figures)
+    if info.status == "diverged":
+        print(f"diverged: {info.reason}", file=sys.stderr)
+        raise typer.Exit(DIVERGED)
+
+
+def _print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
+    from rich.table import Table
+
+    info = trace.info
+    table = Table(title=f"{trace.scenario.name}, seed {info.seed}: {info.status}")
+    table.add_column("metric")
+    table.add_column("value", justify="right")
+    table.add_column("unit")
+    for name, value in info.metrics.items():
+        table.add_row(name, number(value), UNITS.get(name, ""))
+    print_table(table, soft_wrap=True)
+    simulated = len(trace) * trace.scenario.dt
+    print(f"{simulated:g} s simulated in {info.wall_s:.2f} s")
+    print(f"log      {near(log)}")
+    for figure in figures:
+        print(f"figure   {near(figure)}")
+    print(f"replay   dnnmso replay {near(log)}")

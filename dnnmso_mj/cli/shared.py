@@ -1,0 +1,73 @@
+"""What several commands have in common: options, exit statuses, tables and bars."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from dnnmso_mj.simulate import Progress
+
+DIVERGED = 1
+BAD_INPUT = 2
+INTERRUPTED = 130
+
+Log = Annotated[Path, typer.Argument(help="A log that `dnnmso run` wrote (.mcap).")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a key, e.g. plant.gravity=1.62."),
+]
+Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
+
+
+def working(what: str) -> AbstractContextManager[object]:
+    """A spinner on standard error, when that is a terminal, for work of unknown length."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    return console.status(f"{what} …") if console.is_terminal else nullcontext()
+
+
+@contextmanager
+def progress_bar(name: str, total: int) -> Iterator[Progress]:
+    """A bar on standard error, when that is a terminal; it takes the number of new steps."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+    from rich.progress import TimeRemainingColumn as TimeColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn(name), BarColumn(), TaskProgressColumn(), TimeColumn())
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
+        task = bar.add_task(name, total=total)
+        yield lambda done: bar.advance(task, done)
+
+
+def print_table(table: Table, soft_wrap: bool = False) -> None:
+    """Print a table on standard output, square brackets as they are."""
+    from rich.console import Console
+
+    Console(markup=False, soft_wrap=soft_wrap).print(table)
+
+
+def near(path: Path) -> Path:
+    """The path as a person here would type it."""
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
+
+
+def number(value: Any) -> str:
+    """A metric in four digits; "none" for one that has no value."""
+    return f"{value:.4g}" if isinstance(value, float) else "none" if value is None else str(value)
+
+
+def listing(items: Mapping[str, object]) -> str:
+    """Names and values on one line."""
+    return ", ".join(f"{name} {value}" for name, value in items.items())

@@ -1,0 +1,97 @@
+"""The rules that tie one part of a scenario to another: sizes to joints, times and gains to dt."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dnnmso_mj.scenario import Scenario
+
+MAX_TICKS = 100_000_000
+
+Problem = tuple[str, str]
+
+
+def contradictions(scenario: Scenario) -> list[Problem]:
+    """Every key path that does not go with the others, and what is wrong with it."""
+    return [
+        *_step_count(scenario),
+        *_times_below_dt(scenario),
+        *_observer_gain(scenario),
+        *_sizes(scenario),
+    ]
+
+
+def entries(count: int) -> str:
+    """A length in words."""
+    return "1 entry" if count == 1 else f"{count} entries"
+
+
+def _step_count(scenario: Scenario) -> Iterator[Problem]:
+    steps = scenario.duration / scenario.dt
+    if not 0.5 < steps <= MAX_TICKS or abs(steps - round(steps)) > 1e-6:
+        allowed = f"allowed: a whole number of steps from 1 to {MAX_TICKS}"
+        yield "duration", f"is {steps:.10g} steps of dt = {scenario.dt}; {allowed}"
+
+
+def _times_below_dt(scenario: Scenario) -> Iterator[Problem]:
+    """Motions within less than a step: no controller sees them, and splines overflow on them."""
+    ref, dt = scenario.reference, scenario.dt
+    allowed = f"allowed: dt = {dt} or more"
+    if ref.kind == "setpoint" and ref.blend_time < dt:
+        yield "reference.blend_time", f"is less than one step; {allowed}"
+    if ref.kind == "waypoints":
+        for k, gap in enumerate(b - a for a, b in zip(ref.times, ref.times[1:], strict=False)):
+            if gap < dt * (1 - 1e-9):
+                text = f"comes {gap:.3g} s after the time before, less than one step; {allowed}"
+                yield f"reference.times.{k + 1}", text
+
+
+def _observer_gain(scenario: Scenario) -> Iterator[Problem]:
+    most = 2.0 / scenario.dt
+    if max(scenario.controller.observer.K2) >= most:
+        problem = f"makes a sampled observer unstable; allowed: K2 < 2/dt = {most:g}"
+        yield "controller.observer.K2", problem
+
+
+def _sizes(scenario: Scenario) -> Iterator[Problem]:
+    n = scenario.n_joints
+    for path, found, allowed in _vectors(scenario, n):
+        if found not in allowed:
+            choices = " or ".join(map(str, sorted(allowed)))
+            reason = f"since initial.q has {entries(n)}"
+            yield path, f"has {entries(found)}; allowed: {choices}, {reason}"
+
+
+def _vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:
+    """Every vector: its key path, its length and the lengths allowed."""
+    yield "initial.qd", len(scenario.initial.qd), {1, n}
+    if scenario.plant.masses:
+        yield "plant.masses", len(scenario.plant.masses), {n}
+    yield from _reference_vectors(scenario, n)
+    inversion = scenario.controller.inversion
+    yield "controller.inversion.K", len(inversion.K), {1, 2 * n}
+    if inversion.slack_matrix:
+        yield "controller.inversion.slack_matrix", len(inversion.slack_matrix), {2 * n}
+    if inversion.effectiveness.kind == "inertia":
+        for name in ("masses", "lengths"):
+            values = getattr(inversion.effectiveness, name)
+            if values:
+                yield f"controller.inversion.effectiveness.{name}", len(values), {n}
+    yield "controller.observer.K2", len(scenario.controller.observer.K2), {1, 2 * n}
+    if scenario.imperfections.torque_limit:
+        yield "imperfections.torque_limit", len(scenario.imperfections.torque_limit), {1, n}
+
+
+def _reference_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:
+    ref = scenario.reference
+    if ref.kind == "sinusoid":
+        for name in ("amplitude", "frequency", "phase", "offset"):
+            yield f"reference.{name}", len(getattr(ref, name)), {1, n}
+    elif ref.kind == "setpoint":
+        yield "reference.start", len(ref.start), {n}
+        yield "reference.goal", len(ref.goal), {n}
+    else:
+        for k, point in enumerate(ref.points):
+            yield f"reference.points.{k}", len(point), {n}
