@@ -1,0 +1,165 @@
+"""A sweep on this machine: one process a core, each behind a pipe of its own.
+
+Every worker is a fresh interpreter. Since each has its own pipe, a process that dies (a segfault,
+an out-of-memory kill) points at the very run it was in, and no other worker notices.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from multiprocessing.connection import wait
+
+from dnnmso_mj.sweep.plan import SweepError
+from dnnmso_mj.sweep.task import Row, Task, failed_row
+
+# The cores are shared out by the sweep; a library's own threads would only fight for them.
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+)
+
+
+class LocalEngine:
+    """Runs tasks on the cores of this machine.
+
+    Args:
+        jobs: worker processes; None takes every core that this process may use.
+    """
+
+    name = "local"
+
+    def __init__(self, jobs: int | None = None) -> None:
+        self.jobs = jobs or len(os.sched_getaffinity(0))
+
+    def rows(self, tasks: Iterable[Task]) -> Generator[Row]:
+        """Yield every run's row as it is finished; closing the generator ends the workers.
+
+        A run whose process dies is tried once more, after all others; if that dies too, its row
+        says how.
+
+        Raises:
+            SweepError: workers cannot be started.
+        """
+        pool = _Pool(tasks)
+        try:
+            yield from pool.rows(self.jobs)
+        finally:
+            pool.kill()
+
+
+class _Pool:
+    """The workers, what each has to do, and what is to be tried again."""
+
+    def __init__(self, tasks: Iterable[Task]) -> None:
+        self._tasks = iter(tasks)
+        self._rest: deque[Task] = deque()  # of tasks whose process died
+        self._again: deque[Task] = deque()  # runs that were under way when it did
+        self._suspects: set[tuple[int, int]] = set()
+        self._workers: list[_Worker] = []
+
+    def rows(self, jobs: int) -> Iterator[Row]:
+        for _ in range(jobs):
+            self._start()
+        while self._workers:
+            speaking = wait([worker.pipe for worker in self._workers])
+            for worker in [worker for worker in self._workers if worker.pipe in speaking]:
+                yield from self._listen(worker)
+
+    def kill(self) -> None:
+        for worker in self._workers:
+            worker.kill()
+        self._workers.clear()
+
+    def _listen(self, worker: _Worker) -> Iterator[Row]:
+        """Take one message, or the end, of a worker; give it more to do when it is done."""
+        try:
+            message = worker.pipe.recv()
+        except (EOFError, OSError):
+            self._workers.remove(worker)
+            yield from self._bury(worker)
+            self._start()
+            return
+        if worker.seeds:
+            worker.seeds.popleft()
+            yield message
+        worker.ready = True
+        if not worker.seeds:
+            self._feed(worker)
+
+    def _start(self) -> None:
+        task = self._next()
+        if task is not None:
+            self._workers.append(_Worker(task))
+
+    def _feed(self, worker: _Worker) -> None:
+        task, worker.first = worker.first or self._next(), None
+        if task is None:
+            self._workers.remove(worker)
+            worker.kill()
+        else:
+            worker.give(task)
+
+    def _next(self) -> Task | None:
+        if self._rest:
+            return self._rest.popleft()
+        task = next(self._tasks, None)
+        return self._again.popleft() if task is None and self._again else task
+
+    def _bury(self, worker: _Worker) -> Iterator[Row]:
+        """Account for the runs of a worker that died."""
+        how = worker.cause_of_death()
+        if not worker.ready:
+            raise SweepError(f"a worker process cannot start: {how}; its own words stand above")
+        culprit, *others = worker.seeds
+        if others:
+            self._rest.append(replace(worker.task, seeds=tuple(others)))
+        run = (worker.task.point, culprit)
+        if run in self._suspects:
+            yield failed_row(*run, f"its process died twice: {how}")
+        else:
+            self._suspects.add(run)
+            self._again.append(replace(worker.task, seeds=(culprit,)))
+
+
+class _Worker:
+    """One process, its task, and the seeds of it whose rows are still to come."""
+
+    def __init__(self, first: Task) -> None:
+        self.first: Task | None = first  # for when it is ready
+        self.task = first
+        self.seeds: deque[int] = deque()
+        self.ready = False
+        self.pipe, theirs = multiprocessing.Pipe()
+        command = [sys.executable, "-m", "dnnmso_mj.sweep.worker", str(theirs.fileno())]
+        self._process = subprocess.Popen(  # noqa: S603  # no part of it comes from outside
+            command,
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=2,  # whatever a controller prints is not the sweep's output
+            env=os.environ | ONE_THREAD,
+            start_new_session=True,  # Ctrl-C is for the sweep to handle
+        )
+        theirs.close()
+
+    def give(self, task: Task) -> None:
+        self.task, self.seeds = task, deque(task.seeds)
+        with suppress(OSError):  # it is dead, as the next message will tell
+            self.pipe.send(task)
+
+    def kill(self) -> None:
+        self.pipe.close()
+        self._process.kill()
+        self._process.wait()
+
+    def cause_of_death(self) -> str:
+        """How the process ended, after its end of the pipe has closed."""
+        self.pipe.close()
+        code = self._process.wait()
+        return signal.Signals(-code).name if code < 0 else f"exit status {code}"

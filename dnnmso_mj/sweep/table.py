@@ -1,0 +1,126 @@
+"""The finished table of a sweep: its columns, their types, and the file that holds them."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from dnnmso_mj.sweep.plan import Plan, SweepError
+
+METADATA_KEY = b"dnnmso_sweep"
+
+# The names are `compute_metrics`' own.
+METRIC_TYPES: dict[str, pa.DataType] = {
+    "rmse": pa.float64(),
+    "rmse_steady": pa.float64(),
+    "max_abs_error_steady": pa.float64(),
+    "tau_peak": pa.float64(),
+    "tau_chatter": pa.float64(),
+    "f_err_rms_steady": pa.float64(),
+    "settling_time": pa.float64(),
+    "bound_violations": pa.int64(),
+    "diverged": pa.bool_(),
+    "compute_us_p50": pa.float64(),
+    "compute_us_p999": pa.float64(),
+    "deadline_misses": pa.int64(),
+}
+# What differs from one execution of the same run to the next.
+TIMING = ("compute_us_p50", "compute_us_p999", "deadline_misses", "wall_s")
+
+ROW_SCHEMA = pa.schema(
+    [
+        pa.field("point", pa.int32(), nullable=False),
+        pa.field("seed", pa.int64(), nullable=False),
+        pa.field("status", pa.string(), nullable=False),
+        pa.field("reason", pa.string(), nullable=False),
+        *METRIC_TYPES.items(),
+        pa.field("ticks", pa.int64(), nullable=False),
+        ("wall_s", pa.float64()),
+    ]
+)
+
+
+def finished_table(rows: pa.Table, plan: Plan, provenance: dict[str, Any]) -> pa.Table:
+    """Rows in any order, as the table whose order only the plan decides.
+
+    Args:
+        rows: of `ROW_SCHEMA`, one for each run.
+        plan: gives the parameters of each point.
+        provenance: kept as JSON in the metadata.
+    """
+    rows = rows.sort_by([("point", "ascending"), ("seed", "ascending")])
+    columns, fields = [rows["seed"]], [ROW_SCHEMA.field("seed")]
+    for name in plan.points[0].parameters:
+        values = _column([point.parameters[name] for point in plan.points])
+        columns.append(values.take(rows["point"].combine_chunks()))
+        fields.append(pa.field(name, values.type))
+    for field in list(ROW_SCHEMA)[2:]:
+        columns.append(rows[field.name])
+        fields.append(field)
+    text = json.dumps(provenance, ensure_ascii=False)
+    return pa.table(columns, schema=pa.schema(fields, metadata={METADATA_KEY: text}))
+
+
+def write_table(table: pa.Table, out: Path) -> None:
+    """Write Parquet: whole under its name, or not at all.
+
+    Raises:
+        SweepError: the file cannot be written.
+    """
+    unfinished = out.with_name(f".{out.name}.tmp")
+    try:
+        with unfinished.open("wb") as stream:
+            pq.write_table(table, stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        unfinished.replace(out)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        raise SweepError(f"{out}: cannot be written: {error.strerror or error}") from error
+
+
+def read_table(path: Path) -> tuple[pa.Table, dict[str, Any]]:
+    """A finished table and its provenance.
+
+    Raises:
+        SweepError: not a table that a sweep has written.
+    """
+    try:
+        table = pq.read_table(path)
+        return table, json.loads(table.schema.metadata[METADATA_KEY])
+    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
+        raise SweepError(f"{path}: not a table of `dnnmso sweep`: {error}") from error
+
+
+def unfinished_rows(table: pa.Table, n_points: int) -> pa.Table:
+    """A finished table of `n_points` as rows of `ROW_SCHEMA`, to be added to."""
+    per_point = max(1, len(table) // n_points)
+    points = pa.array([k // per_point for k in range(len(table))], pa.int32())
+    columns = [points, *(table[name] for name in ROW_SCHEMA.names[1:])]
+    return pa.table(columns, schema=ROW_SCHEMA)
+
+
+def _column(values: Sequence[Any]) -> pa.Array:
+    """Typed where all values are of one kind; JSON text where they are not."""
+    kinds = {type(value) for value in values if value is not None}
+    if kinds <= {int, float} or (len(kinds) == 1 and not kinds & {list, dict}):
+        try:
+            return pa.array(values)
+        except (pa.ArrowException, OverflowError):
+            pass
+    return _nested(values, kinds)
+
+
+def _nested(values: Sequence[Any], kinds: set[type]) -> pa.Array:
+    if kinds == {list}:
+        try:
+            return pa.array(values, pa.list_(pa.float64()))
+        except (pa.ArrowException, TypeError):
+            pass
+    return pa.array([json.dumps(value, ensure_ascii=False) for value in values])
