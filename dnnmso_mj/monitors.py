@@ -97,9 +97,9 @@ def learn(net: Net, watch: Watch, monitors: Monitors) -> None:
 
 
 @inner
-def _span(net: Net, layer: int) -> tuple[int, int]:
+def _span(net: Net, layer: int) -> slice:
     rows = net.sizes[layer] + net.bias
-    return net.starts[layer], net.starts[layer] + rows * net.strides[layer]
+    return slice(net.starts[layer], net.starts[layer] + rows * net.strides[layer])
 
 
 @inner
@@ -108,33 +108,47 @@ def _sum_up(net: Net, watch: Watch) -> None:
     eta, eta_max, sigma_max, beta = net.madam
     correction = 1.0 - beta ** net.updates[0] if net.bias_correction else 1.0
     most_sq = (eta_max / eta) ** 2 / correction
-    limit = net.w.dtype.type(sigma_max)
     for layer in range(net.strides.size):
-        start, end = _span(net, layer)
-        w_sq = g_sq = gw = dw_sq = clipped = 0.0
-        for i in range(start, end):
-            w, g = float(watch.w[i]), float(watch.g[i])
-            change = float(net.w[i]) - w
-            w_sq += w * w
-            g_sq += g * g
-            gw += abs(g * w)
-            dw_sq += change * change
-            ratio_clamped = g * g > most_sq * float(net.v[i])
-            weight_clamped = abs(net.w[i]) >= limit
-            clipped += 1.0 if ratio_clamped or weight_clamped else 0.0
-        sums = watch.stats[layer]
-        sums[W_SQ], sums[G_SQ], sums[GW], sums[DW_SQ] = w_sq, g_sq, gw, dw_sq
-        sums[CLIPPED] = clipped
+        span, sums = _span(net, layer), watch.stats[layer]
+        _sum_layer(watch.w[span], watch.g[span], net.w[span], sums)
+        sums[CLIPPED] = _count_clamped(watch.g[span], net.w[span], net.v[span], most_sq, sigma_max)
+
+
+@compiled
+def _sum_layer(before: Array, g: Array, after: Array, sums: Array) -> None:
+    w_sq = g_sq = gw = dw_sq = 0.0
+    for i in range(before.size):
+        w, gradient = float(before[i]), float(g[i])
+        change = float(after[i]) - w
+        w_sq += w * w
+        g_sq += gradient * gradient
+        gw += abs(gradient * w)
+        dw_sq += change * change
+    sums[W_SQ], sums[G_SQ], sums[GW], sums[DW_SQ] = w_sq, g_sq, gw, dw_sq
+
+
+@compiled
+def _count_clamped(g: Array, w: Array, v: Array, most_sq: float, sigma_max: float) -> float:
+    """How many have |g/ḡ| > η*/η or |w| = σ*."""
+    most, limit, count = w.dtype.type(most_sq), w.dtype.type(sigma_max), 0
+    for i in range(w.size):
+        count += (g[i] * g[i] > most * v[i]) | (abs(w[i]) >= limit)
+    return float(count)
 
 
 @inner
 def _gradient_change(net: Net, watch: Watch, out: Array) -> None:
     """‖g_l(W+ΔW) − g_l(W)‖/‖g_l(W)‖ (L,); 0 where a layer has no gradient."""
     for layer in range(net.strides.size):
-        start, end = _span(net, layer)
-        old = turned = 0.0
-        for i in range(start, end):
-            before, after = float(watch.g[i]), float(watch.g_after[i])
-            old += before * before
-            turned += (after - before) ** 2
-        out[layer] = math.sqrt(turned / old) if old > 0.0 else 0.0
+        span = _span(net, layer)
+        out[layer] = _turn(watch.g[span], watch.g_after[span])
+
+
+@compiled
+def _turn(before: Array, after: Array) -> float:
+    old = turned = 0.0
+    for i in range(before.size):
+        g = float(before[i])
+        old += g * g
+        turned += (float(after[i]) - g) ** 2
+    return math.sqrt(turned / old) if old > 0.0 else 0.0

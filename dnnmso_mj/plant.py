@@ -7,7 +7,9 @@ torques, and is read by joint angle and velocity.
 from __future__ import annotations
 
 import logging
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -150,6 +152,39 @@ def compile_spec(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
     return model
 
 
+# A sweep builds the same few models thousands of times; whoever takes one takes a copy.
+@lru_cache(maxsize=16)
+def _plant_model(plant: PlantSpec, dt: float, mjcf: Mjcf) -> mujoco.MjModel:
+    return compile_spec(build_spec(plant, dt, mjcf), plant.model)
+
+
+@lru_cache(maxsize=16)
+def _nominal_model(
+    plant: PlantSpec, known: Inertia | None, dt: float, mjcf: Mjcf
+) -> mujoco.MjModel:
+    """The plant, with the masses and lengths that the controller believes."""
+    spec = build_spec(plant, dt, mjcf)
+    masses = (known and known.masses) or plant.masses
+    lengths = (known and known.lengths) or plant.lengths
+    part = "controller.inversion.effectiveness"
+    if (masses is None) != (lengths is None):
+        raise ScenarioError(
+            f"{part}: masses or lengths alone; allowed: both, or none, where plant.masses and "
+            "plant.lengths are null"
+        )
+    if (
+        masses is not None
+        and lengths is not None
+        and (masses, lengths)
+        != (
+            plant.masses,
+            plant.lengths,
+        )
+    ):
+        set_links(spec, plant.links, masses, lengths, part=part)
+    return compile_spec(spec, plant.model)
+
+
 class PlantView(NamedTuple):
     """The simulated robot as compiled code sees it, by address; keep its `Plant` alive."""
 
@@ -176,8 +211,7 @@ class Plant:
     """
 
     def __init__(self, scenario: Scenario, mjcf: Mjcf) -> None:
-        spec = build_spec(scenario.plant, scenario.dt, mjcf)
-        self.model = compile_spec(spec, scenario.plant.model)
+        self.model = deepcopy(_plant_model(scenario.plant, scenario.dt, mjcf))
         if self.model.nv != scenario.n_joints:
             raise ScenarioError(
                 f"initial.q has {scenario.n_joints} entries; allowed: {self.model.nv}, "
@@ -261,24 +295,8 @@ class NominalModel:
 
     def __init__(self, scenario: Scenario, mjcf: Mjcf) -> None:
         effectiveness = scenario.controller.inversion.effectiveness
-        spec = build_spec(scenario.plant, scenario.dt, mjcf)
-        if isinstance(effectiveness, Inertia):
-            masses = effectiveness.masses or scenario.plant.masses
-            lengths = effectiveness.lengths or scenario.plant.lengths
-            if (masses is None) != (lengths is None):
-                raise ScenarioError(
-                    "controller.inversion.effectiveness: masses or lengths alone; allowed: both, "
-                    "or none, where plant.masses and plant.lengths are null"
-                )
-            if masses is not None and lengths is not None:
-                set_links(
-                    spec,
-                    scenario.plant.links,
-                    masses,
-                    lengths,
-                    part="controller.inversion.effectiveness",
-                )
-        self.model = compile_spec(spec, scenario.plant.model)
+        known = effectiveness if isinstance(effectiveness, Inertia) else None
+        self.model = deepcopy(_nominal_model(scenario.plant, known, scenario.dt, mjcf))
         data = mujoco.MjData(self.model)
         self.view = Nominal(
             model=self.model._address,

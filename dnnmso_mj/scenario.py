@@ -385,6 +385,26 @@ class Imperfections(Strict):
     """Largest |torque| of each joint's actuator (N·m); null: none."""
 
 
+class Stall(Strict):
+    """A hang of the controller, to see what follows from it."""
+
+    at: NonNegative
+    """When (s)."""
+    duration: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
+    """How long (s of the wall clock)."""
+
+
+class RealTime(Strict):
+    """What `dnnmso run --real-time` does where a command comes too late; else without effect."""
+
+    watchdog: Literal["hold", "zero", "damped"] = "hold"
+    """Torque of a period without a command in time: the last one, none, or -damping q̇."""
+    damping: NonNegative = 5.0
+    """Of the damped watchdog (N·m·s/rad)."""
+    stalls: Annotated[tuple[Stall, ...], BeforeValidator(_tuple)] = ()
+    """Hangs of the controller, put in on purpose."""
+
+
 class Scenario(Strict):
     """One experiment. Where the paper gives a number, it is the default."""
 
@@ -408,6 +428,8 @@ class Scenario(Strict):
     """What drives the robot."""
     imperfections: Imperfections = Imperfections()
     """Limits of the robot's parts; none unless given."""
+    real_time: RealTime = RealTime()
+    """What happens when the wall clock is not kept."""
 
     @property
     def n_joints(self) -> int:

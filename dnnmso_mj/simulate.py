@@ -48,6 +48,10 @@ HEAD_START_NS = 20_000_000  # from a paced run's beginning to its first tick
 BLOCK = 50  # ticks between two looks at the recorder, progress and interrupts
 CHUNK = 1000  # ticks of the reference sampled at once
 SNAPSHOT_PERIOD = 1.0  # s
+CHANGES = {
+    "saturated": ("torque limit reached", "torque limit left"),
+    "deadline_missed": ("deadline missed: the watchdog acts", "in time again"),
+}
 AS_FAST_AS_CAN_BE = Pace(0, 0, 0.0, np.zeros((0, 2), np.int64))
 
 
@@ -124,7 +128,7 @@ class Simulation:
             timespec=np.zeros(2, np.int64),
             dt=scenario.dt,
         )
-        self._was_saturated = False
+        self._flags = dict.fromkeys(CHANGES, False)
 
     def run(self, recorder: Recorder, progress: Progress | None = None) -> RunInfo:
         """Run the scenario from its start to its end, or to its divergence.
@@ -177,7 +181,7 @@ class Simulation:
         world.tau[:] = 0.0
         world.counts[:] = 0
         self._sample_reference(0)
-        self._was_saturated = False
+        self._flags = dict.fromkeys(CHANGES, False)
 
     def _loop(self, recorder: Recorder, progress: Progress | None) -> None:
         n_ticks, dt = self.scenario.n_ticks, self.scenario.dt
@@ -221,7 +225,7 @@ class Simulation:
             rows = self.world.rows[: counts[ROWS]]
             if len(rows):
                 recorder.append(rows)
-                self._watch_saturation(rows, recorder)
+                self._tell_changes(rows, recorder)
         if counts[STATUS] != RUNNING:
             raise self._why_it_ended()
 
@@ -254,14 +258,15 @@ class Simulation:
         name = next(name for name, values in fields.items() if not np.isfinite(values).all())
         return NonFiniteError(name, fields[name].tolist())
 
-    def _watch_saturation(self, rows: Array, recorder: Recorder) -> None:
-        """An event where the torque limit begins to act, and one where it ceases."""
-        t, saturated = rows[:, 0], rows[:, self.layout.slices["saturated"]][:, 0] != 0.0
-        before = np.concatenate([[self._was_saturated], saturated[:-1]])
-        self._was_saturated = bool(saturated[-1])
-        for i in np.flatnonzero(saturated != before):
-            level, what = ("warning", "reached") if saturated[i] else ("info", "left")
-            recorder.event(Event(float(t[i]), level, f"torque limit {what}"))
+    def _tell_changes(self, rows: Array, recorder: Recorder) -> None:
+        """An event where the torque limit begins to act or ceases, and the watchdog likewise."""
+        for name, (begins, ends) in CHANGES.items():
+            flag = rows[:, self.layout.slices[name]][:, 0] != 0.0
+            before = np.concatenate([[self._flags[name]], flag[:-1]])
+            self._flags[name] = bool(flag[-1])
+            for i in np.flatnonzero(flag != before):
+                level, what = ("warning", begins) if flag[i] else ("info", ends)
+                recorder.event(Event(float(rows[i, 0]), level, what))
 
 
 class MemoryRecorder:
