@@ -164,9 +164,11 @@ class Simulation:
             if self._ticks is not None:
                 self._ticks.run(self.world, self._ticks.parts, 0, 0)
             elif self.world.pace.period_ns:
-                state = self.controller.state()
+                state, world = self.controller.state(), self.world
                 self._start()
-                self._run_interpreted(0, 1)
+                begin_tick(world, 0)
+                command = self.controller.update(world.x, world.x_ref, world.xd_ref)
+                end_tick(world, command, 0)
                 self.controller.restore(state)
         self._start()
 

@@ -1,0 +1,119 @@
+"""The compiled loop: what it stands for, held against MuJoCo and against the interpreted loop."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+import dnnmso_mj
+from dnnmso_mj.controllers import compiled_ticks
+from dnnmso_mj.plant import Plant
+from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
+
+CLOCKED = {"compute_us", "deadline_missed", "wake_late_us"}
+
+
+class Wrapped:
+    """A controller that keeps its law but not its compiled ticks."""
+
+    def __init__(self, controller) -> None:
+        self._controller = controller
+        self.n_layers = controller.n_layers
+
+    def __getattr__(self, name):
+        return getattr(self._controller, name)
+
+    def update(self, x, x_ref, xd_ref):
+        return self._controller.update(x, x_ref, xd_ref)
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "euler", "implicitfast"])
+def test_forward_and_integrate_are_mujocos_step_bit_for_bit(make_scenario, two_link, integrator):
+    plant = Plant(make_scenario(plant={"integrator": integrator}), two_link)
+    data = mujoco.MjData(plant.model)
+    rng = np.random.default_rng(0)
+    data.qpos[:], data.qvel[:] = [0.3, -0.7], [1.0, 2.0]
+    plant.reset(data.qpos, data.qvel)
+    for tau in rng.normal(0.0, 20.0, size=(200, 2)):
+        data.ctrl[:] = tau
+        mujoco.mj_step(plant.model, data)
+        plant.step(tau)
+        assert np.array_equal(plant.q, data.qpos)
+        assert np.array_equal(plant.qd, data.qvel)
+
+
+@pytest.mark.parametrize("kind", ["dnn_mso", "no_network", "classical_mso"])
+@pytest.mark.parametrize("limit", [None, 20.0])
+def test_interpreted_and_compiled_loop_give_the_same_run(make_scenario, two_link, kind, limit):
+    scenario = make_scenario({"kind": kind}, duration=1.0, imperfections={"torque_limit": limit})
+    simulation = Simulation(scenario, two_link)
+    assert compiled_ticks(simulation.controller) is not None
+    simulation.controller = Wrapped(simulation.controller)
+    assert compiled_ticks(simulation.controller) is None
+    recorder = MemoryRecorder(simulation.layout, scenario.n_ticks)
+    interpreted = recorder.trace(scenario, simulation.run(recorder))
+    compiled = simulate(scenario, two_link)
+    for name in set(compiled) - CLOCKED:
+        assert np.array_equal(interpreted[name], compiled[name]), name
+
+
+def test_a_controller_whose_update_is_replaced_is_not_run_by_its_compiled_ticks(
+    make_scenario, two_link
+):
+    controller = Simulation(make_scenario(), two_link).controller
+    law = type(controller)
+
+    class Other(law):
+        def update(self, x, x_ref, xd_ref):
+            return super().update(x, x_ref, xd_ref)
+
+    controller.__class__ = Other
+    assert compiled_ticks(controller) is None
+    controller.__class__ = law
+    assert compiled_ticks(controller) is not None
+    controller.update = lambda *_: None
+    assert compiled_ticks(controller) is None
+
+
+@pytest.mark.parametrize("kind", ["dnn_mso", "classical_mso"])
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_watching_the_network_changes_nothing_of_the_run(make_scenario, kind, precision):
+    controller = {"kind": kind, "network": {"precision": precision}}
+    scenario = make_scenario(controller, duration=1.0)
+    watched, alone = simulate(scenario), simulate(scenario, watch=False)
+    for name in ("q", "qd", "tau", "x_hat", "f_hat", "f_true", "ultimate_bound"):
+        assert np.array_equal(watched[name], alone[name]), name
+    assert watched["weight_norm"].all()
+    assert not alone["weight_norm"].any()
+
+
+def test_a_changed_source_is_compiled_anew_though_its_callers_file_is_not(tmp_path):
+    """Compiled code holds its callees: numba alone would run the old ones."""
+    package = tmp_path / "dnnmso_mj"
+    root = Path(dnnmso_mj.__file__).parent
+    shutil.copytree(root, package, ignore=shutil.ignore_patterns("__pycache__"))
+    program = (
+        "import numpy as np; from dnnmso_mj import kernel; from dnnmso_mj.network import Shape\n"
+        "from dnnmso_mj.scenario import Madam\n"
+        "shape = Shape((1, 1), bias=False, activation='sigmoid')\n"
+        "net = kernel.build_net(shape, np.ones(1), Madam())\n"
+        "kernel.forward(net, np.ones(1)); print(net.acts[net.slots[1]])\n"
+    )
+
+    def output() -> float:
+        command = [sys.executable, "-c", program]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        return float(done.stdout)
+
+    assert output() == 1.0
+    copying = package / "compiling.py"
+    text = copying.read_text()
+    assert "out[i] = values[i]" in text
+    copying.write_text(text.replace("out[i] = values[i]", "out[i] = 2.0 * values[i]"))
+    assert output() == 2.0
