@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from dnnmso_mj.figures.tracking import error_figure, torque_figure, tracking_fig
 from dnnmso_mj.trace import Trace
 
 _COLOURS = 64
+_WHITE = 250  # levels above it, of 255
 
 
 def run_figures(trace: Trace) -> dict[str, Figure]:
@@ -63,10 +65,12 @@ def save_figures(trace: Trace, out_dir: Path, stem: str) -> list[Path]:
     """Write the figures of one run as `out_dir/stem_NAME.png`, replacing older ones whole.
 
     Raises:
-        DnnmsoError: the run has no tick, or the folder cannot be written; no file is half-written.
+        DnnmsoError: the run has no tick, or some figures, which are named, cannot be written; the
+            others are, and none is half-written.
     """
-    figures = run_figures(trace)
-    return _save({out_dir / f"{stem}_{name}.png": figure for name, figure in figures.items()})
+    with _no_collection():
+        figures = run_figures(trace)
+        return _save({out_dir / f"{stem}_{name}.png": figure for name, figure in figures.items()})
 
 
 def save_comparison(traces: Sequence[Trace], labels: Sequence[str], out_dir: Path) -> list[Path]:
@@ -75,8 +79,21 @@ def save_comparison(traces: Sequence[Trace], labels: Sequence[str], out_dir: Pat
     Raises:
         DnnmsoError: as `comparison_figures`, or the folder cannot be written.
     """
-    figures = comparison_figures(traces, labels)
-    return _save({out_dir / f"comparison_{name}.png": figure for name, figure in figures.items()})
+    with _no_collection():
+        figures = comparison_figures(traces, labels)
+        return _save({out_dir / f"comparison_{name}.png": f for name, f in figures.items()})
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Without garbage collection: it goes through all of matplotlib's objects again and again."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _title(trace: Trace) -> str:
@@ -111,26 +128,33 @@ def _require_ticks(runs: Mapping[str, Trace]) -> None:
 
 
 def _save(figures: Mapping[Path, Figure]) -> list[Path]:
-    """Render everything, write it beside its place, and only then move it there."""
-    with house_style():
-        rendered = {path: _png(figure) for path, figure in figures.items()}
-    parts: dict[Path, Path] = {}
-    try:
-        for path, png in rendered.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            parts[path] = path.with_name(f".{path.name}.{os.getpid()}.part")
-            parts[path].write_bytes(png)
-        for path, part in parts.items():
-            part.replace(path)
-    except OSError as error:
+    """Write each figure beside its place, and only then move it there."""
+    failed: dict[Path, OSError] = {}
+    for path, figure in figures.items():
+        with house_style():
+            png = _png(figure)
+        try:
+            _replace(path, png)
+        except OSError as error:
+            failed[path] = error
+    if failed:
+        names = ", ".join(str(path) for path in failed)
+        reason = next(iter(failed.values())).strerror
         raise DnnmsoError(
-            f"cannot write figure {path}: {error.strerror}; choose a folder that can be written"
-        ) from None
+            f"cannot write figure {names}: {reason}; choose a folder that can be written"
+        )
+    return list(figures)
+
+
+def _replace(path: Path, data: bytes) -> None:
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(data)
+        part.replace(path)
     finally:
-        for part in parts.values():
-            with suppress(OSError):
-                part.unlink(missing_ok=True)
-    return list(rendered)
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def _png(figure: Figure) -> bytes:
@@ -139,6 +163,9 @@ def _png(figure: Figure) -> bytes:
     canvas.draw()
     size = canvas.get_width_height(physical=True)
     picture = Image.frombytes("RGBA", size, bytes(canvas.buffer_rgba())).convert("RGB")
+    few = picture.quantize(_COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    # It takes white and its faintest shades together: white is to stay white.
+    few.putpalette([255 if level > _WHITE else level for level in few.getpalette() or ()])
     buffer = io.BytesIO()
-    picture.quantize(_COLOURS, dither=Image.Dither.NONE).save(buffer, "png")
+    few.save(buffer, "png")
     return buffer.getvalue()

@@ -6,15 +6,18 @@ import functools
 import platform
 import shutil
 import subprocess
+import sys
 from importlib.metadata import version
 from pathlib import Path
 
-_PACKAGES = ("dnnmso_mj", "mujoco", "numpy", "numba")
+_PACKAGES = ("dnnmso_mj", "mujoco", "numpy", "scipy", "numba")
+_WHERE_USED = ("torch",)  # a run may do without
 
 
 def software_versions() -> dict[str, str]:
     """Versions of Python and of every package that numbers in a log depend on."""
-    packages = {name: version(name) for name in _PACKAGES}
+    used = [name for name in _WHERE_USED if name in sys.modules]
+    packages = {name: version(name) for name in (*_PACKAGES, *used)}
     return {"python": platform.python_version(), "platform": platform.platform(), **packages}
 
 

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import time
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dnnmso_mj.errors import LogError
+from dnnmso_mj.errors import LogError, RunInterrupted
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.paths import find_model, logs_dir
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.reading import read_trace
+from dnnmso_mj.realtime import left_in_peace, real_time_pace
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulate import Progress, Simulation
-from dnnmso_mj.trace import Trace
+from dnnmso_mj.simulate import AS_FAST_AS_CAN_BE, Progress, Simulation
+from dnnmso_mj.trace import Event, RunInfo, Trace
 
 MAX_NUMBERED = 10_000
 
@@ -35,6 +38,7 @@ def run_logged(
     out: Path | None = None,
     *,
     force: bool = False,
+    real_time: bool = False,
     progress: Progress | None = None,
 ) -> LoggedRun:
     """Run a scenario and leave a log with metrics.
@@ -46,30 +50,48 @@ def run_logged(
         scenario: the experiment.
         out: the log; by default logs/NAME.mcap, or logs/NAME-2.mcap … where that exists.
         force: whether an existing `out` is replaced.
+        real_time: whether ticks are paced by the wall clock; see `realtime`.
         progress: called now and then with the number of ticks done since.
 
     Raises:
         ScenarioError: the model cannot be used; no log is left behind.
         LogError: the log exists or cannot be written.
+        RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run.
     """
     mjcf = Mjcf.read(find_model(scenario.plant.model))
-    simulation = Simulation(scenario, mjcf)
+    pace = real_time_pace(scenario) if real_time else AS_FAST_AS_CAN_BE
+    simulation = Simulation(scenario, mjcf, pace=pace)
     with _open_log(simulation, mjcf, out, force) as recorder:
-        info = simulation.run(recorder, progress)
-        recorder.flush()
-        if recorder.ticks:
-            trace = read_trace(recorder.path)
-        else:  # diverged before its first row
-            empty = np.empty((0, simulation.layout.width))
-            trace = Trace(simulation.layout.columns(empty), scenario, info)
-        written: dict[str, Any] = {
-            "versions": trace.info.versions,
-            "git_commit": trace.info.git_commit,
-        }
-        trace = replace(trace, info=replace(info, **written))
-        info = replace(trace.info, metrics=compute_metrics(trace))
-        recorder.finish(info)
-    return LoggedRun(replace(trace, info=info), recorder.path)
+        started = time.perf_counter()
+        try:
+            with left_in_peace() if real_time else nullcontext() as priority:
+                if priority:
+                    recorder.event(Event(0.0, "info", f"real time, {priority}"))
+                info = simulation.run(recorder, progress)
+        except KeyboardInterrupt as stop:
+            wall = time.perf_counter() - started
+            info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
+            _finish(simulation, recorder, info)
+            raise RunInterrupted(recorder.path, recorder.ticks) from stop
+        return LoggedRun(_finish(simulation, recorder, info), recorder.path)
+
+
+def _finish(simulation: Simulation, recorder: McapRecorder, info: RunInfo) -> Trace:
+    """Compute the metrics of what the log holds, and end the log with them."""
+    recorder.flush()
+    if recorder.ticks:
+        trace = read_trace(recorder.path)
+    else:  # ended before its first row
+        empty = np.empty((0, simulation.layout.width))
+        trace = Trace(simulation.layout.columns(empty), simulation.scenario, info)
+    written: dict[str, Any] = {
+        "versions": trace.info.versions,
+        "git_commit": trace.info.git_commit,
+    }
+    trace = replace(trace, info=replace(info, **written))
+    info = replace(trace.info, metrics=compute_metrics(trace))
+    recorder.finish(info)
+    return replace(trace, info=info)
 
 
 def _open_log(simulation: Simulation, mjcf: Mjcf, out: Path | None, force: bool) -> McapRecorder:

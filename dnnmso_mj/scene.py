@@ -98,10 +98,13 @@ class Scene:
         joints = [link.joint for link in self.links]
         self._xyz = np.array([link.xyz for link in self.links]).reshape(-1, 3)
         self._quat = np.array([link.quat_xyzw for link in self.links]).reshape(-1, 4)
-        self._axis = np.array([j.axis if j else np.zeros(3) for j in joints]).reshape(-1, 3)
+        axis = np.array([j.axis if j else np.zeros(3) for j in joints]).reshape(-1, 3)
         self._index = np.array([j.index if j else 0 for j in joints], dtype=int)
-        self._turns = np.array([bool(j and j.kind == "hinge") for j in joints])
-        self._slides = np.array([bool(j and j.kind == "slide") for j in joints])
+        turns = np.array([[bool(j and j.kind == "hinge")] for j in joints]).reshape(-1, 1)
+        # Per radian and per metre: what a joint adds is linear in sin(q/2), cos(q/2) and q.
+        self._half = 0.5 * turns[:, 0]
+        self._turn = multiply(self._quat, np.pad(turns * axis, ((0, 0), (0, 1))))
+        self._slide = rotate(self._quat, ~turns * axis)
         self._tip_chain, self._tip_offset = self._find_tip(model)
 
     def transforms(self, q: Array) -> Array:
@@ -114,11 +117,11 @@ class Scene:
             [xyz, quat_xyzw] of each link, shape (..., n_links, 7).
         """
         q_link = np.asarray(q, dtype=float)[..., self._index]  # (..., n_links)
-        half = np.where(self._turns, 0.5 * q_link, 0.0)[..., None]
-        turn = np.concatenate([self._axis * np.sin(half), np.cos(half)], axis=-1)
-        shift = np.where(self._slides, q_link, 0.0)[..., None] * self._axis
-        xyz = self._xyz + rotate(self._quat, shift)
-        return np.concatenate([xyz, multiply(self._quat, turn)], axis=-1)
+        half = (self._half * q_link)[..., None]
+        out = np.empty((*q_link.shape, 7))
+        out[..., :3] = self._xyz + self._slide * q_link[..., None]
+        out[..., 3:] = self._turn * np.sin(half) + self._quat * np.cos(half)
+        return out
 
     def tip(self, q: Array) -> Array:
         """World position (m) of the site named "tip", or of the last body: (..., n) -> (..., 3)."""

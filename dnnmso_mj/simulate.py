@@ -97,6 +97,7 @@ class Simulation:
         self.reference = Reference(scenario.reference, n)
         self.controller = controller or build_controller(scenario, mjcf, watch=watch)
         self.layout = StepLayout(n, self.controller.n_layers)
+        self._columns = {name: self.layout.slices[name].start for name in CHANGES}
         bounds = build_bounds(
             scenario.controller.inversion,
             n,
@@ -263,7 +264,9 @@ class Simulation:
     def _tell_changes(self, rows: Array, recorder: Recorder) -> None:
         """An event where the torque limit begins to act or ceases, and the watchdog likewise."""
         for name, (begins, ends) in CHANGES.items():
-            flag = rows[:, self.layout.slices[name]][:, 0] != 0.0
+            flag = rows[:, self._columns[name]] != 0.0
+            if not (flag.any() or self._flags[name]):
+                continue
             before = np.concatenate([[self._flags[name]], flag[:-1]])
             self._flags[name] = bool(flag[-1])
             for i in np.flatnonzero(flag != before):

@@ -1,15 +1,15 @@
 """Logs for the tests, and a child process that writes one until it is stopped.
 
-As a program: log_samples.py LOG COUNTER appends ticks for ever; COUNTER, mapped into memory, says
-at every moment how many.
+As a program: log_samples.py LOG COUNTER TICKS appends so many ticks and waits; COUNTER, mapped into
+memory, says at every moment how many.
 """
 
 from __future__ import annotations
 
-import itertools
 import mmap
 import signal
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,11 @@ def rows(count: int, layout: StepLayout = LAYOUT, dt: float = 1e-3) -> np.ndarra
     return out
 
 
+def blocks(data: np.ndarray, size: int = 30) -> list[np.ndarray]:
+    """Rows as the loop hands them over: a block at a time, not of the size the log has."""
+    return [data[k : k + size] for k in range(0, len(data), size)]
+
+
 def recorder(path: Path, layout: StepLayout = LAYOUT, **parts: Any) -> McapRecorder:
     return McapRecorder(path, layout, scenario(**parts), scene(), MJCF)
 
@@ -56,8 +61,8 @@ def recorder(path: Path, layout: StepLayout = LAYOUT, **parts: Any) -> McapRecor
 def append_all(path: Path, data: np.ndarray, info: RunInfo = OK) -> None:
     """A finished log of these rows and nothing else."""
     with recorder(path) as log:
-        for row in data:
-            log.append(row)
+        for block in blocks(data):
+            log.append(block)
         log.finish(info)
 
 
@@ -68,22 +73,27 @@ def write_log(
     data = rows(count, layout)
     with recorder(path, layout, **parts) as log:
         log.snapshot("controller", 0.0, {"W": np.arange(6.0).reshape(2, 3)})
-        for row in data:
-            log.append(row)
+        for block in blocks(data):
+            log.append(block)
         log.event(Event(0.1, "warning", "torque limit reached"))
         log.snapshot("controller", 0.2, {"W": np.full(3, 0.1), "n": np.array(4)})
         log.finish(RunInfo(status="ok", seed=7, wall_s=0.25, metrics=METRICS))
     return data
 
 
-def append_for_ever(path: Path, counter: Path) -> None:
-    data = rows(1000)
+def append_and_wait(path: Path, counter: Path, ticks: int) -> None:
+    """Append rows, a block a millisecond as the loop does, then wait for a signal."""
+    data = np.resize(rows(1000), (ticks, LAYOUT.width))
+    done = 0
     with counter.open("r+b") as file, mmap.mmap(file.fileno(), 8) as shared, recorder(path) as log:
-        for done in itertools.count(1):
-            log.append(data[(done - 1) % len(data)])
+        for block in blocks(data):
+            log.append(block)
+            done += len(block)
             shared[:] = done.to_bytes(8, sys.byteorder)
+            time.sleep(1e-3)
+        signal.pause()
 
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
-    append_for_ever(Path(sys.argv[1]), Path(sys.argv[2]))
+    append_and_wait(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]))

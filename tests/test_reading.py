@@ -27,7 +27,7 @@ from dnnmso_mj.reading import log_info, read_snapshots, read_trace, recover
 from dnnmso_mj.trace import FLAGS, SCALARS, Event, RunInfo
 
 COUNT = 230
-ONE_STEP = StepFormat(LAYOUT).encode(rows(1))[0]
+ONE_STEP = StepFormat(LAYOUT).encode(rows(1)).tobytes()
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_a_log_comes_back_as_it_was_written(log):
 def test_times_of_events_come_back_exactly(tmp_path, t):
     events = tuple(Event(t, level, f"a {level}") for level in ("info", "warning", "error"))
     with recorder(tmp_path / "run.mcap") as open_log:
-        open_log.append(rows(1)[0])
+        open_log.append(rows(1))
         for event in events:
             open_log.event(event)
         open_log.finish(RunInfo(status="ok", seed=7))
@@ -154,6 +154,14 @@ def test_a_damaged_log_gives_its_prefix_or_one_message(tmp_path_factory, log, pl
         assert str(path) in (refusal(read, path) or str(path))
     message = refusal(read_trace, path)
     assert str(path) in message if message else assert_prefix(path)
+
+
+def test_a_log_changed_beside_its_chunks_is_not_taken_for_whole(log, tmp_path):
+    data, path = log.read_bytes(), tmp_path / "changed.mcap"
+    path.write_bytes(data.replace(b"0.25", b"0.52", 1))
+    assert log_info(log).complete
+    info = log_info(path)
+    assert (info.complete, info.status, info.wall_s) == (False, "unfinished", 0.52)
 
 
 def mcap(path: Path, fill: Callable[[Writer], object]) -> Path:

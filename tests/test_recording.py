@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import resource
 import signal
 import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,8 @@ from log_samples import (
     MJCF,
     OK,
     append_all,
-    append_for_ever,
+    append_and_wait,
+    blocks,
     recorder,
     rows,
     scenario,
@@ -34,12 +36,14 @@ from log_samples import (
 from mcap.reader import make_reader
 from mcap.records import Message
 
+from dnnmso_mj import recording
 from dnnmso_mj.errors import LogError
+from dnnmso_mj.log.writer import CHUNK_BYTES
 from dnnmso_mj.reading import log_info, read_snapshots, read_trace
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.trace import Event, RunInfo, StepLayout
 
-LOST_TICKS = 100  # 0.1 s at 1 kHz
+LOST_TICKS = 49  # a block in progress
 
 
 def messages(path: Path, topic: str) -> list[Message]:
@@ -60,14 +64,12 @@ def full_disk(limit: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def child_writing(log: Path, folder: Path, ticks: int) -> Iterator[tuple[subprocess.Popen, Path]]:
-    """A process that appends ticks for ever, once it has appended so many; and its counter."""
+    """A process that appends so many ticks and then waits; and its counter of them."""
     counter = folder / "counter"
     counter.write_bytes(bytes(8))
-    program = Path(sys.modules[append_for_ever.__module__].__file__)
-    child = subprocess.Popen([sys.executable, str(program), str(log), str(counter)])
+    program = Path(sys.modules[append_and_wait.__module__].__file__)
+    child = subprocess.Popen([sys.executable, str(program), str(log), str(counter), str(ticks)])
     try:
-        while appended(counter) < ticks and child.poll() is None:
-            time.sleep(1e-4)
         yield child, counter
     finally:
         child.kill()
@@ -78,10 +80,27 @@ def appended(counter: Path) -> int:
     return int.from_bytes(counter.read_bytes(), sys.byteorder)
 
 
-@pytest.mark.parametrize("ticks", np.random.default_rng(0).integers(1, 5000, 5).tolist())
-def test_sigkill_loses_at_most_a_tenth_of_a_second(tmp_path, ticks):
+def wait_until(condition: Callable[[], bool], what: str) -> None:
+    end = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < end, f"not within 20 s: {what}"
+        time.sleep(1e-4)
+
+
+def ticks_in(log: Path) -> int:
+    """Ticks of a log that may not have begun yet."""
+    try:
+        return log_info(log).ticks
+    except LogError:
+        return 0
+
+
+@pytest.mark.parametrize("ticks", np.random.default_rng(0).integers(1, 5000, 4).tolist())
+def test_sigkill_loses_no_more_than_the_block_in_progress(tmp_path, ticks):
     log = tmp_path / "run.mcap"
     with child_writing(log, tmp_path, ticks) as (child, counter):
+        wait_until(lambda: appended(counter) == ticks, "all appended")
+        wait_until(lambda: ticks_in(log) >= ticks - LOST_TICKS, "the file has them")
         child.send_signal(signal.SIGKILL)
         assert child.wait(30) == -signal.SIGKILL
     info = log_info(log)
@@ -90,35 +109,68 @@ def test_sigkill_loses_at_most_a_tenth_of_a_second(tmp_path, ticks):
     assert (info.scenario, info.seed) == ("sample", 7)
     assert "mujoco" in info.versions
     assert info.attachments == {"model.xml": len(MJCF)}
-    assert appended(counter) - LOST_TICKS <= info.ticks <= appended(counter) + 1
+    assert info.ticks == ticks // 50 * 50
     if info.ticks:
-        expected = np.resize(rows(1000), (info.ticks, LAYOUT.width))
-        np.testing.assert_array_equal(read_trace(log)["tau"], expected[:, LAYOUT.slices["tau"]])
+        assert_rows(log)
+
+
+@pytest.mark.parametrize("ticks", np.random.default_rng(2).integers(100, 5000, 3).tolist())
+def test_sigkill_in_the_midst_of_writing_leaves_a_readable_prefix(tmp_path, ticks):
+    log = tmp_path / "run.mcap"
+    with child_writing(log, tmp_path, 100_000) as (child, counter):
+        wait_until(lambda: appended(counter) >= ticks and ticks_in(log) > 0, "under way")
+        child.send_signal(signal.SIGKILL)
+        assert child.wait(30) == -signal.SIGKILL
+    assert_rows(log)
+
+
+def assert_rows(log: Path) -> None:
+    trace = read_trace(log)
+    expected = np.resize(rows(1000), (len(trace), LAYOUT.width))
+    np.testing.assert_array_equal(trace["tau"], expected[:, LAYOUT.slices["tau"]])
 
 
 @pytest.mark.parametrize("ticks", np.random.default_rng(1).integers(1, 5000, 3).tolist())
 def test_ctrl_c_at_any_moment_leaves_a_complete_log_of_all_ticks(tmp_path, ticks):
     log = tmp_path / "run.mcap"
-    with child_writing(log, tmp_path, ticks) as (child, counter):
+    with child_writing(log, tmp_path, 100_000) as (child, counter):
+        wait_until(lambda: appended(counter) >= ticks, "under way")
         child.send_signal(signal.SIGINT)
         assert child.wait(30) == -signal.SIGINT  # how Python ends on a KeyboardInterrupt
     info = log_info(log)
     assert info.complete
     assert info.status == "interrupted"
-    assert appended(counter) <= info.ticks <= appended(counter) + 1
+    assert appended(counter) <= info.ticks <= appended(counter) + 30
     assert [m.sequence for m in messages(log, "/step")] == list(range(info.ticks))
 
 
 @pytest.mark.parametrize("dt", [1e-5, 1e-3, 2.5e-3, 0.1])
-def test_memory_never_holds_more_than_a_tenth_of_a_second(tmp_path, dt):
+def test_rows_reach_the_file_by_themselves(tmp_path, dt):
     log = tmp_path / "run.mcap"
-    data = rows(20)
-    with recorder(log, dt=dt, duration=100 * dt) as open_log:
-        for k in range(220):
-            open_log.append(data[k % 20])
-            if k % 20 == 0:
-                assert (k + 1 - log_info(log).ticks) * dt < 0.1
+    block = max(1, min(int(0.05 / dt), CHUNK_BYTES // 400))  # a row takes more than 400 bytes
+    with recorder(log, dt=dt, duration=1000 * dt) as open_log:
+        for first in range(0, 1000, 20):
+            open_log.append(rows(20))
+            waiting = first + 20 - block
+            wait_until(lambda least=waiting: log_info(log).ticks >= least, f"{waiting} ticks")
         open_log.finish(OK)
+
+
+def test_a_run_that_waited_for_its_disk_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(recording, "BACKLOG_BYTES", 0)
+    with recorder(tmp_path / "run.mcap") as log:
+        log.append(rows(40))
+        waited = log.waited_s
+        assert waited > 0.0
+        log.finish(OK)
+    (event,) = log_info(tmp_path / "run.mcap").events
+    assert (event.t, event.level) == (0.04, "warning")
+    assert event.message == f"the run waited {waited:.3g} s for the disk that its log is on"
+
+
+def test_a_run_that_did_not_wait_says_nothing(tmp_path):
+    append_all(tmp_path / "run.mcap", rows(40))
+    assert log_info(tmp_path / "run.mcap").events == ()
 
 
 @pytest.mark.parametrize("dt", [1e-5, 1e-3, 3e-3])
@@ -232,6 +284,16 @@ def test_events_are_foxglove_logs_at_their_times(tmp_path):
     assert (event.level, event.message) == (Log.WARNING, "torque limit reached")
 
 
+def test_an_event_is_written_once_with_the_ticks_that_led_to_it(tmp_path):
+    log = tmp_path / "run.mcap"
+    with recorder(log) as open_log:
+        for k, block in enumerate(blocks(rows(230))):
+            open_log.append(block)
+            open_log.event(Event(0.03 * k, "info", f"block {k}"))
+        open_log.finish(OK)
+    assert [e.message for e in log_info(log).events] == [f"block {k}" for k in range(8)]
+
+
 def test_two_logs_of_the_same_rows_have_the_same_step_messages(tmp_path):
     for name in ("a", "b"):
         write_log(tmp_path / name, 120)
@@ -239,13 +301,28 @@ def test_two_logs_of_the_same_rows_have_the_same_step_messages(tmp_path):
     assert a == b
 
 
-def test_append_copies_its_row(tmp_path):
-    log, row = tmp_path / "run.mcap", rows(1)[0]
+def test_append_and_snapshot_copy_what_they_are_given(tmp_path):
+    log, block, weights = tmp_path / "run.mcap", rows(7), np.ones(3)
     with recorder(log) as open_log:
-        open_log.append(row)
-        row[:] = 0.0
+        open_log.append(block)
+        open_log.snapshot("net", 0.0, {"W": weights})
+        block[:], weights[:] = 0.0, 0.0
+        assert open_log.ticks == 7
         open_log.finish(OK)
-    np.testing.assert_array_equal(read_trace(log)["q"], rows(1)[:, LAYOUT.slices["q"]])
+    np.testing.assert_array_equal(read_trace(log)["q"], rows(7)[:, LAYOUT.slices["q"]])
+    np.testing.assert_array_equal(read_snapshots(log)[0].arrays["W"], np.ones(3))
+
+
+@pytest.mark.parametrize("sizes", [[1] * 230, [50] * 5, [30, 200], [230], [0, 49, 1, 51, 129]])
+def test_blocks_of_any_size_make_the_same_messages(tmp_path, sizes):
+    data = rows(sum(sizes))
+    with recorder(tmp_path / "run.mcap") as log:
+        for end, size in zip(np.cumsum(sizes), sizes, strict=True):
+            log.append(data[end - size : end])
+        log.finish(OK)
+    append_all(tmp_path / "other.mcap", data)
+    found, expected = (messages(tmp_path / name, "/step") for name in ("run.mcap", "other.mcap"))
+    assert found == expected
 
 
 def test_a_diverged_row_is_logged_but_not_drawn(tmp_path):
@@ -263,7 +340,7 @@ def test_an_exception_ends_the_log_as_failed_with_its_reason(tmp_path):
 
     def run() -> None:
         with recorder(log) as open_log:
-            open_log.append(rows(1)[0])
+            open_log.append(rows(1))
             open_log.event(Event(0.0, "info", "about to divide"))
             raise ZeroDivisionError("division by zero")
 
@@ -277,7 +354,7 @@ def test_an_exception_ends_the_log_as_failed_with_its_reason(tmp_path):
 
 def test_a_log_left_without_finish_is_failed(tmp_path):
     with recorder(tmp_path / "run.mcap") as open_log:
-        open_log.append(rows(1)[0])
+        open_log.append(rows(1))
     assert log_info(tmp_path / "run.mcap").status == "failed"
 
 
@@ -317,12 +394,29 @@ def test_an_existing_file_is_refused_and_kept(tmp_path):
     assert log.read_text() == "precious"
 
 
-def test_force_replaces_an_existing_file(tmp_path):
+def test_force_replaces_an_existing_log(tmp_path):
     log = tmp_path / "run.mcap"
-    log.write_text("old")
+    append_all(log, rows(70))
     with McapRecorder(log, LAYOUT, scenario(), scene(), MJCF, force=True) as open_log:
         open_log.finish(OK)
-    assert log_info(log).complete
+    assert (log_info(log).complete, log_info(log).ticks) == (True, 0)
+
+
+@pytest.mark.parametrize("kind", ["scenario", "empty", "folder", "fifo", "link to nowhere"])
+def test_force_replaces_nothing_that_is_no_log(tmp_path, kind):
+    path = tmp_path / "paper.yaml"
+    make = {
+        "scenario": lambda: path.write_text("name: paper"),
+        "empty": path.touch,
+        "folder": path.mkdir,
+        "fifo": lambda: os.mkfifo(path),
+        "link to nowhere": lambda: path.symlink_to(tmp_path / "nowhere"),
+    }
+    make[kind]()
+    before = path.lstat()
+    with pytest.raises(LogError, match=r"paper\.yaml (is no log|exists already)"):
+        McapRecorder(path, LAYOUT, scenario(), scene(), MJCF, force=True)
+    assert (path.lstat().st_ino, path.lstat().st_size) == (before.st_ino, before.st_size)
 
 
 def test_a_missing_folder_is_made(tmp_path):
@@ -352,6 +446,27 @@ def test_a_disk_full_on_the_way_is_named_and_leaves_the_prefix(tmp_path):
     assert trace.info.status == "unfinished"
     assert 50 <= len(trace) < 400
     np.testing.assert_array_equal(trace["f_hat"], data[: len(trace), LAYOUT.slices["f_hat"]])
+
+
+def repeat(call: Callable[[McapRecorder], None], log: McapRecorder) -> None:
+    """Call until it raises, for the thread meets the disk's end in its own time."""
+    while True:
+        call(log)
+
+
+def test_a_write_that_failed_is_told_by_the_next_call_whatever_it_is(tmp_path):
+    calls = {
+        "append": lambda log: log.append(rows(1)),
+        "event": lambda log: log.event(Event(0.0, "info", "hello")),
+        "snapshot": lambda log: log.snapshot("net", 0.0, {}),
+        "flush": lambda log: log.flush(),
+        "finish": lambda log: log.finish(OK),
+    }
+    for name, call in calls.items():
+        with full_disk(60_000), recorder(tmp_path / name) as log:
+            log.append(rows(400))
+            with pytest.raises(LogError, match="cannot be written: File too large"):
+                repeat(call, log)
 
 
 def test_a_controller_without_a_network_is_logged_too(tmp_path):

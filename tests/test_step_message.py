@@ -56,11 +56,16 @@ def assert_same_bits(a: np.ndarray, b: np.ndarray) -> None:
     np.testing.assert_array_equal(a.view(np.uint64), b.view(np.uint64))
 
 
+def as_bytes(message: bytes) -> np.ndarray:
+    """One message as `decode` takes them."""
+    return np.frombuffer(message, dtype=np.uint8).reshape(1, -1)
+
+
 @given(layouts_and_rows())
 def test_protobuf_parses_encoded_rows_to_the_same_numbers(case):
     layout, data = case
     for row, message in zip(data, StepFormat(layout).encode(data), strict=True):
-        parsed = STEP.FromString(message)
+        parsed = STEP.FromString(message.tobytes())
         values: list[float] = []
         for name in layout.widths:
             value = getattr(parsed, name)
@@ -71,8 +76,9 @@ def test_protobuf_parses_encoded_rows_to_the_same_numbers(case):
 @given(layouts_and_rows())
 def test_messages_of_another_protobuf_writer_decode_to_the_same_numbers(case):
     layout, data = case  # zeros are left out by that writer, so sizes differ
-    messages = [as_message(row, layout).SerializeToString() for row in data]
-    assert_same_bits(StepFormat(layout).decode(messages), data)
+    for row in data:
+        message = as_message(row, layout).SerializeToString()
+        assert_same_bits(StepFormat(layout).decode(as_bytes(message)), row[None])
 
 
 @given(layouts_and_rows())
@@ -80,9 +86,9 @@ def test_decode_inverts_encode_bit_for_bit(case):
     layout, data = case
     wire = StepFormat(layout)
     messages = wire.encode(data)
-    assert {len(message) for message in messages} == {wire.size}
+    assert messages.shape == (len(data), wire.size)
     assert_same_bits(wire.decode(messages), data)
-    assert layout_of(messages[0]) == layout
+    assert layout_of(messages[0].tobytes()) == layout
 
 
 def test_unpacked_vectors_decode_too():
@@ -91,8 +97,9 @@ def test_unpacked_vectors_decode_too():
         if field.label == FieldDescriptorProto.LABEL_REPEATED:
             field.options.packed = False
     data = rows(3)
-    messages = [as_message(row, LAYOUT, parser(files)).SerializeToString() for row in data]
-    assert_same_bits(StepFormat(LAYOUT).decode(messages), data)
+    for row in data:
+        message = as_message(row, LAYOUT, parser(files)).SerializeToString()
+        assert_same_bits(StepFormat(LAYOUT).decode(as_bytes(message)), row[None])
 
 
 def row_without_zeros() -> np.ndarray:
@@ -105,7 +112,8 @@ def row_without_zeros() -> np.ndarray:
 
 def test_bytes_are_protobufs_own_when_no_value_is_zero():
     data = row_without_zeros()
-    assert StepFormat(LAYOUT).encode(data) == [as_message(data[0], LAYOUT).SerializeToString()]
+    expected = as_message(data[0], LAYOUT).SerializeToString()
+    assert StepFormat(LAYOUT).encode(data).tobytes() == expected
 
 
 def test_fields_in_another_order_decode_too():
@@ -121,14 +129,15 @@ def test_fields_in_another_order_decode_too():
     parts[1], parts[2] = parts[2], parts[1]  # q and qd, which are of one size
     message = b"".join(parts)
     assert len(message) == StepFormat(LAYOUT).size
-    assert_same_bits(StepFormat(LAYOUT).decode([message]), data)
+    assert_same_bits(StepFormat(LAYOUT).decode(as_bytes(message)), data)
 
 
 def test_any_number_but_zero_is_a_true_flag():
-    data = rows(1)
-    data[:, LAYOUT.slices["deadline_missed"]] = 1.0
-    (message,) = StepFormat(LAYOUT).encode(data)
-    assert_same_bits(StepFormat(LAYOUT).decode([message[:-1] + b"\x02"]), data)
+    data = np.repeat(rows(1), 2, axis=0)
+    data[:, LAYOUT.slices["deadline_missed"]] = [[0.0], [1.0]]
+    messages = StepFormat(LAYOUT).encode(data)
+    messages[1, messages[0] != messages[1]] = 2
+    assert_same_bits(StepFormat(LAYOUT).decode(messages), data)
 
 
 def test_schema_numbers_fields_in_the_order_of_the_layout():
@@ -145,27 +154,28 @@ def test_schema_numbers_fields_in_the_order_of_the_layout():
 def test_without_a_network_its_fields_are_absent_and_have_no_columns():
     layout = StepLayout(n_joints=2, n_layers=0)
     messages = StepFormat(layout).encode(rows(4, layout))
-    assert not STEP.FromString(messages[0]).weight_norm
+    assert not STEP.FromString(messages[0].tobytes()).weight_norm
     columns = layout.columns(StepFormat(layout).decode(messages))
     assert columns["weight_norm"].shape == (4, 0)
 
 
 def test_no_rows_make_no_messages_and_back():
     wire = StepFormat(LAYOUT)
-    assert wire.encode(rows(0)) == []
-    assert wire.decode([]).shape == (0, LAYOUT.width)
+    assert wire.encode(rows(0)).shape == (0, wire.size)
+    assert wire.decode(wire.encode(rows(0))).shape == (0, LAYOUT.width)
 
 
 def test_decode_refuses_what_is_no_step():
-    first = StepFormat(LAYOUT).encode(rows(1))[0]
-    with pytest.raises(ValueError, match=r"message 1 is no dnnmso\.Step"):
-        StepFormat(LAYOUT).decode([first, b"\xff" * len(first)])
+    messages = StepFormat(LAYOUT).encode(rows(2))
+    messages[1] = 0xFF
+    with pytest.raises(ValueError, match=r"message 31 is no dnnmso\.Step"):
+        StepFormat(LAYOUT).decode(messages, first=30)
 
 
 def test_decode_refuses_vectors_of_another_width():
     longer = StepLayout(n_joints=3, n_layers=4)
-    messages = StepFormat(LAYOUT).encode(rows(1)) + StepFormat(longer).encode(rows(1, longer))
-    with pytest.raises(ValueError, match="message 1 has 3 entries in q; expected 2"):
+    messages = StepFormat(longer).encode(rows(1, longer))
+    with pytest.raises(ValueError, match="message 0 has 3 entries in q; expected 2"):
         StepFormat(LAYOUT).decode(messages)
 
 
@@ -175,5 +185,8 @@ def test_schema_check_names_the_fields_that_differ():
     files.file[0].message_type[0].field[1].name = "angles"
     with pytest.raises(ValueError, match=r"differ from this version's in angles, q$"):
         check_schema(files.SerializeToString())
+    damaged = schema().SerializeToString().replace(b"q_meas", b"q_\xffeas")
+    with pytest.raises(ValueError, match=r"differ from this version's in .*q_meas"):
+        check_schema(damaged)
     with pytest.raises(ValueError, match="no protobuf FileDescriptorSet"):
         check_schema(b"\xff\xff")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,8 +23,10 @@ from dnnmso_mj.cli.shared import (
 from dnnmso_mj.errors import RunInterrupted, ScenarioError
 
 if TYPE_CHECKING:
+    from dnnmso_mj.timing import Timing
     from dnnmso_mj.trace import Trace
 
+MISSES_SHOWN = 20
 UNITS = {
     "rmse": "rad",
     "rmse_steady": "rad",
@@ -45,18 +48,22 @@ def run(
     seed: Annotated[int | None, typer.Option(help="Seed of the initial weights.")] = None,
     out: Annotated[Path | None, typer.Option(help="The log; default logs/NAME.mcap.")] = None,
     force: Annotated[bool, typer.Option(help="Replace an existing --out.")] = False,
+    real_time: Annotated[
+        bool, typer.Option("--real-time", help="Keep to the wall clock, one tick each dt.")
+    ] = False,
     plot: Annotated[bool, typer.Option(help="Draw the figures beside the log.")] = True,
     as_json: Json = False,
 ) -> None:
     """Run a scenario headless: log, figures, summary."""
     from dnnmso_mj.loading import load_scenario, located
     from dnnmso_mj.run import run_logged
+    from dnnmso_mj.timing import timing
 
     sets = [*(overrides or []), *([] if seed is None else [f"seed={seed}"])]
     loaded = load_scenario(scenario, sets)
     try:
         with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
-            done = run_logged(loaded, out, force=force, progress=progress)
+            done = run_logged(loaded, out, force=force, real_time=real_time, progress=progress)
     except ScenarioError as error:
         raise located(error, scenario, sets) from error
     except RunInterrupted as stop:
@@ -79,9 +86,12 @@ def run(
             "seed": info.seed,
             "wall_s": info.wall_s,
             "metrics": dict(info.metrics),
+            **({"real_time": asdict(timing(done.trace))} if real_time else {}),
         }))  # fmt: skip
     else:
         _print_summary(done.trace, done.log, figures)
+        if real_time:
+            _print_timing(timing(done.trace))
     if info.status == "diverged":
         print(f"diverged: {info.reason}", file=sys.stderr)
         raise typer.Exit(DIVERGED)
@@ -104,3 +114,19 @@ def _print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
     for figure in figures:
         print(f"figure   {near(figure)}")
     print(f"replay   dnnmso replay {near(log)}")
+
+
+def _print_timing(timing: Timing) -> None:
+    """How the wall clock was kept: computing apart from waking, and each miss."""
+    from rich.table import Table
+
+    table = Table("real time (µs)", *timing.compute_us)
+    for name, values in (("computing", timing.compute_us), ("woken late", timing.wake_late_us)):
+        table.add_row(name, *(f"{value:.0f}" for value in values.values()))
+    print_table(table)
+    for cause in ("computing", "waking"):
+        print(f"missed by {cause}: {timing.ticks_missed(cause)} ticks")
+    for miss in timing.misses[:MISSES_SHOWN]:
+        print(f"  t = {miss.t:.3f} s: {miss.ticks} ticks, by {miss.cause}")
+    if len(timing.misses) > MISSES_SHOWN:
+        print(f"  and {len(timing.misses) - MISSES_SHOWN} more times; all are events of the log")

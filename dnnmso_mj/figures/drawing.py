@@ -44,18 +44,23 @@ _STYLE = {
     "lines.linewidth": 1.1,
     "legend.fontsize": 7.5,
     "legend.frameon": False,
-    "legend.handlelength": 1.4,
-    "legend.columnspacing": 1.0,
-    "legend.handletextpad": 0.5,
+    "legend.handlelength": 1.2,
+    "legend.columnspacing": 0.8,
+    "legend.handletextpad": 0.4,
     "figure.titlesize": 9,
+    # Places that follow from no text's size: measuring every text first takes as long as drawing.
+    "axes.titley": 1.0,
     "figure.dpi": 150,
 }
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_WIDTH = 9.0  # in
-_PANEL_HEIGHT = 1.75  # in
+# in
+_WIDTH = 9.0
+_PANEL_HEIGHT = 1.75
+_LEFT, _RIGHT, _BOTTOM = 0.72, 0.17, 0.43  # beside panels: tick labels and axis labels
+_TITLE, _PANEL_TITLE, _LEGEND_ROW = 0.28, 0.25, 0.17
 _LEGEND_WIDTH = 110  # characters beside a title, in a panel as wide as the figure
-_DRAWN_WHOLE = 6_000  # points of a line; a longer one is drawn by its envelope
+_BUCKETS = 1_500  # across a figure; one is narrower than a pixel
 
 
 @contextmanager
@@ -66,43 +71,76 @@ def house_style() -> Iterator[None]:
 
 
 def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
-    """A figure with `count` panels, filled row by row."""
+    """A figure with `count` panels, filled row by row; `arrange` gives them their places."""
     rows = math.ceil(count / columns)
-    figure = Figure(figsize=(_WIDTH, 0.35 + _PANEL_HEIGHT * rows), layout="constrained")
+    figure = Figure(figsize=(_WIDTH, 0.35 + _PANEL_HEIGHT * rows))
     axes = list(figure.subplots(rows, columns, squeeze=False).ravel())
     for spare in axes[count:]:
         spare.remove()
     if title:
-        figure.suptitle(title, x=0.01, ha="left")
+        figure.suptitle(title, x=0.01, y=1.0 - 0.08 / figure.get_figheight(), ha="left")
     return figure, axes[:count]
 
 
-def envelope(values: Array) -> Array:
+def arrange(figure: Figure, axes: list[Axes], legend_rows: int = 1) -> None:
+    """Put panels and their labels in their places, which follow from the panels' number alone.
+
+    Args:
+        figure: of `panels`.
+        axes: of `panels`; a row whose panels have no time labels takes less room.
+        legend_rows: of the legend above the first panel.
+    """
+    specification = axes[0].get_subplotspec()
+    rows, columns = specification.get_geometry()[:2] if specification else (1, 1)
+    more = _LEGEND_ROW * max(0, legend_rows - 1)
+    height = figure.get_figheight() + more
+    figure.set_figheight(height)
+    labelled = axes[0].xaxis.get_tick_params()["labelbottom"]
+    gap = _PANEL_TITLE + (_BOTTOM if labelled or rows == 1 else 0.1)
+    top = height - _TITLE - _PANEL_TITLE - more
+    panel_height = (top - _BOTTOM - gap * (rows - 1)) / rows
+    panel_width = (_WIDTH - columns * (_LEFT + _RIGHT)) / columns
+    figure.subplots_adjust(
+        left=_LEFT / _WIDTH,
+        right=1.0 - _RIGHT / _WIDTH,
+        bottom=_BOTTOM / height,
+        top=top / height,
+        wspace=(_LEFT + _RIGHT) / panel_width,
+        hspace=gap / panel_height,
+    )
+    for ax in axes:
+        ax.yaxis.set_label_coords((0.15 - _LEFT) / panel_width, 0.5)
+        ax.xaxis.set_label_coords(0.5, (0.2 - _BOTTOM) / panel_height)
+
+
+def envelope(values: Array, buckets: int = _BUCKETS) -> Array:
     """Indices whose points draw the same picture as all points do, in order.
 
-    The first, smallest, largest and last point of each bucket of ticks, none as wide as a pixel:
-    no spike is lost, and time and memory do not grow with the run.
+    The smallest and largest of each bucket of ticks, and the first and last point of all: no spike
+    is lost, and time and memory do not grow with the run. A line of few points is drawn whole.
 
     Args:
         values: one line, shape (N,); NaN is a gap.
+        buckets: how many, each narrower than a pixel.
     """
     n_ticks = len(values)
-    if n_ticks <= _DRAWN_WHOLE:
+    if n_ticks <= 2 * buckets:
         return np.arange(n_ticks)
-    size = math.ceil(n_ticks / (_DRAWN_WHOLE // 4))
-    whole = n_ticks // size * size
-    starts = np.arange(0, whole, size)
-    buckets = values[:whole].reshape(-1, size)
-    gaps = np.isnan(buckets)
-    lowest = starts + np.where(gaps, np.inf, buckets).argmin(axis=1)
-    highest = starts + np.where(gaps, -np.inf, buckets).argmax(axis=1)
-    rest = whole + envelope(values[whole:])
-    return np.unique(np.concatenate([starts, lowest, highest, starts + size - 1, rest]))
+    size = math.ceil(n_ticks / buckets)
+    starts = np.arange(0, n_ticks, size)
+    table = np.full((len(starts), size), np.nan)
+    table.ravel()[:n_ticks] = values
+    gaps = np.isnan(table)
+    lowest = starts + np.where(gaps, np.inf, table).argmin(axis=1)
+    highest = starts + np.where(gaps, -np.inf, table).argmax(axis=1)
+    return np.unique(np.concatenate([[0, n_ticks - 1], lowest, highest]))
 
 
 def line(axes: Axes, t: Array, values: Array, **how: Any) -> None:
     """Draw values (N,) over t (N,) in seconds."""
-    drawn = envelope(values)
+    place = axes.get_subplotspec()
+    columns = place.get_geometry()[1] if place else 1
+    drawn = envelope(values, _BUCKETS // columns)
     axes.plot(t[drawn], values[drawn], **how)
 
 
@@ -129,20 +167,23 @@ def name_time_panel(axes: Axes, span: tuple[float, float], title: str, y: str) -
     name_panel(axes, title, "t (s)", y)
 
 
-def legend_above(axes: Axes) -> None:
-    """A legend above the axes, where it hides no data; none for a single entry."""
+def legend_above(axes: Axes) -> int:
+    """A legend above the axes, where it hides no data, unless for a single entry; its rows."""
     handles, labels = axes.get_legend_handles_labels()
     entries = dict(zip(labels, handles, strict=True))
-    if len(entries) > 1:
-        longest = max(len(label) for label in entries)
-        axes.legend(
-            entries.values(),
-            entries.keys(),
-            loc="lower right",
-            bbox_to_anchor=(1.0, 1.0),
-            borderaxespad=0.0,
-            ncols=max(1, min(len(entries), _LEGEND_WIDTH // (longest + 6))),
-        )
+    if len(entries) < 2:
+        return 0
+    longest = max(len(label) for label in entries)
+    columns = max(1, min(len(entries), _LEGEND_WIDTH // (longest + 6)))
+    axes.legend(
+        entries.values(),
+        entries.keys(),
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.0,
+        ncols=columns,
+    )
+    return math.ceil(len(entries) / columns)
 
 
 def span_of(traces: Iterable[Trace]) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from dnnmso_mj.figures.drawing import (
     COLOURS,
     DASHED,
     INK,
+    arrange,
     decades,
     legend_above,
     line,
@@ -50,6 +51,7 @@ def _drawn(trace: Trace, draw: list[Panel], title: str) -> Figure:
     for ax, panel in zip(axes, draw, strict=True):
         panel(ax, trace)
         legend_above(ax)
+    arrange(figure, axes)
     return figure
 
 

@@ -14,6 +14,7 @@ from dnnmso_mj.figures.drawing import (
     COLOURS,
     DASHED,
     INK,
+    arrange,
     legend_above,
     line,
     log_line,
@@ -86,10 +87,11 @@ def _columns(count: int) -> int:
 
 def _finished(figure: Figure, axes: list[Axes]) -> Figure:
     """One legend for all panels, and time labels only under the last panel of each column."""
-    legend_above(axes[0])
+    legend_rows = legend_above(axes[0])
     for ax in axes[: -_columns(len(axes))]:
         ax.set_xlabel("")
         ax.tick_params(labelbottom=False)
+    arrange(figure, axes, legend_rows)
     return figure
 
 

@@ -7,7 +7,6 @@ import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import BinaryIO
 
@@ -17,7 +16,7 @@ from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap.writer import CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC
 
 from dnnmso_mj.errors import LogError
 from dnnmso_mj.log import step_message
@@ -28,7 +27,6 @@ Array = np.ndarray
 
 NS_PER_S = 1_000_000_000
 MODEL = "model.xml"  # the attachment that holds the MJCF
-_CHUNK_BYTES = 64 * 1024
 _SNAPSHOT, _NPZ = "snapshot/", ".npz"
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 _LEVEL_NAMES = {number: name for name, number in _LEVELS.items()}
@@ -75,15 +73,32 @@ def create(path: Path, force: bool = False) -> BinaryIO:
     """Open a new file, in a folder that is made when missing.
 
     Raises:
-        LogError: the file exists and `force` does not say to remove it, or cannot be written.
+        LogError: the file exists and `force` does not say to remove it, or is no log, or cannot be
+            written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if force:
-            path.unlink(missing_ok=True)
+            _remove_log(path)
         return _open_new(path)
     except OSError as error:
         raise unwritable(path, error) from error
+
+
+def _remove_log(path: Path) -> None:
+    """Remove a file that begins like a log; what is no log is never removed."""
+    if not path.exists():
+        return
+    magic = b""
+    if path.is_file():  # opening a FIFO would wait for a writer
+        with path.open("rb") as file:
+            magic = file.read(len(MCAP0_MAGIC))
+    if magic != MCAP0_MAGIC:
+        raise LogError(
+            f"{path} is no log (an MCAP file), and --force replaces nothing else. "
+            "Choose another name."
+        )
+    path.unlink()
 
 
 def _open_new(path: Path) -> BinaryIO:
@@ -100,15 +115,6 @@ def unwritable(path: Path, error: OSError) -> LogError:
     return LogError(
         f"{path} cannot be written: {error.strerror or error}. Choose another place for it."
     )
-
-
-def new_writer(file: BinaryIO) -> Writer:
-    """Start an MCAP file whose chunks are small enough to be compressed within a control period."""
-    writer = Writer(
-        file, chunk_size=_CHUNK_BYTES, compression=CompressionType.LZ4, enable_data_crcs=True
-    )
-    writer.start(library=f"dnnmso_mj {version('dnnmso_mj')}")
-    return writer
 
 
 def timestamp(time_ns: int) -> Timestamp:
@@ -136,7 +142,7 @@ def event_of(data: bytes) -> Event:
     try:
         message = Log.FromString(data)
     except DecodeError as error:
-        raise ValueError(f"a message on {EVENTS.name} is no {EVENTS.schema_name}") from error
+        raise ValueError(f"a message is no {EVENTS.schema_name}") from error
     t = (message.timestamp.seconds * NS_PER_S + message.timestamp.nanos) / NS_PER_S
     return Event(t, _LEVEL_NAMES.get(message.level, "info"), message.message)
 
@@ -208,21 +214,25 @@ def snapshot_place(attachment: str) -> tuple[str, float] | None:
     return place if attachment == snapshot_name(*place) else None
 
 
-def snapshot_data(name: str, arrays: Mapping[str, Array]) -> bytes:
-    """Arrays as NumPy's npz, without pickle.
+def check_snapshot(name: str, arrays: Mapping[str, Array]) -> None:
+    """Refuse what cannot be written without pickle.
 
     Raises:
         LogError: an array holds Python objects.
     """
+    for key, array in arrays.items():
+        if array.dtype.hasobject:
+            raise LogError(
+                f"snapshot {name!r}: array {key!r} has dtype {array.dtype}; "
+                "allowed: numbers, booleans and strings. Convert it to one of these."
+            )
+
+
+def snapshot_data(arrays: Mapping[str, Array]) -> bytes:
+    """Arrays as NumPy's npz, without pickle."""
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w") as archive:
-        for key, value in arrays.items():
-            array = np.asarray(value)
-            if array.dtype.hasobject:
-                raise LogError(
-                    f"snapshot {name!r}: array {key!r} has dtype {array.dtype}; "
-                    "allowed: numbers, booleans and strings. Convert it to one of these."
-                )
+        for key, array in arrays.items():
             with archive.open(f"{key}.npy", "w") as file:
                 np.lib.format.write_array(file, array, allow_pickle=False)
     return data.getvalue()

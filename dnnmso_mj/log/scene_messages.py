@@ -21,7 +21,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 
-from dnnmso_mj.log.format import Topic, protobuf_topic, timestamp
+from dnnmso_mj.log.format import NS_PER_S, Topic, protobuf_topic, timestamp
 from dnnmso_mj.rotations import rotate
 from dnnmso_mj.scene import WORLD, Geom, Scene
 
@@ -45,33 +45,49 @@ def robot_description(urdf: str) -> bytes:
     return b"\x00\x01\x00\x00" + struct.pack("<I", len(text)) + text
 
 
-def frame_transforms(scene: Scene, times_ns: list[int], q: Array, q_ref: Array) -> list[bytes]:
-    """Every link in its parent's frame, of the arm and of its ghost, one message a time.
+class FrameMessages:
+    """Makes messages on /tf: every link in its parent's frame, of the arm and of its ghost.
 
     Args:
         scene: the robot.
-        times_ns: simulation times (ns), N of them.
-        q: joint angles (rad), shape (N, n).
-        q_ref: desired joint angles (rad), shape (N, n).
     """
-    poses, ref_poses = scene.transforms(np.stack([q, q_ref])).tolist()
-    arms = [("", poses), (GHOST, ref_poses)]
-    messages = []
-    for k, time_ns in enumerate(times_ns):
-        stamp = timestamp(time_ns)
-        transforms = [
-            FrameTransform(
-                timestamp=stamp,
-                parent_frame_id=_frame(prefix, link.parent),
-                child_frame_id=_frame(prefix, link.name),
-                translation=Vector3(x=x, y=y, z=z),
-                rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
-            )
-            for prefix, arm in arms
-            for link, (x, y, z, qx, qy, qz, qw) in zip(scene.links, arm[k], strict=True)
-        ]
-        messages.append(FrameTransforms(transforms=transforms).SerializeToString())
-    return messages
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        # One message is filled again and again: making its parts anew takes longer than the rest.
+        self._message = FrameTransforms(
+            transforms=[
+                FrameTransform(
+                    timestamp=timestamp(0),
+                    parent_frame_id=_frame(prefix, link.parent),
+                    child_frame_id=_frame(prefix, link.name),
+                    translation=Vector3(),
+                    rotation=Quaternion(),
+                )
+                for prefix in ("", GHOST)
+                for link in scene.links
+            ]
+        )
+        self._parts = [(t.timestamp, t.translation, t.rotation) for t in self._message.transforms]
+
+    def encode(self, times_ns: list[int], q: Array, q_ref: Array) -> list[bytes]:
+        """One message a time.
+
+        Args:
+            times_ns: simulation times (ns), N of them.
+            q: joint angles (rad), shape (N, n).
+            q_ref: desired joint angles (rad), shape (N, n).
+        """
+        poses = self._scene.transforms(np.stack([q, q_ref], axis=1))  # (N, 2, n_links, 7)
+        parts = poses.reshape(len(q), len(self._parts), 7).tolist()
+        return [self._one(*at) for at in zip(times_ns, parts, strict=True)]
+
+    def _one(self, time_ns: int, poses: list[list[float]]) -> bytes:
+        seconds, nanos = divmod(time_ns, NS_PER_S)
+        for (stamp, xyz, quat), pose in zip(self._parts, poses, strict=True):
+            stamp.seconds, stamp.nanos = seconds, nanos
+            xyz.x, xyz.y, xyz.z, quat.x, quat.y, quat.z, quat.w = pose
+        return self._message.SerializeToString()
 
 
 def scene_update(scene: Scene) -> bytes:

@@ -8,7 +8,6 @@ which may leave out zeros or order fields otherwise, go through protobuf's own p
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -64,7 +63,7 @@ def check_schema(data: bytes) -> None:
         )
     except DecodeError as error:
         raise ValueError(f"the schema of {SCHEMA_NAME} is no protobuf FileDescriptorSet") from error
-    differing = sorted({name for name, *_ in found ^ expected})
+    differing = sorted({str(name) for name, *_ in found ^ expected})  # bytes where damaged
     if differing:
         raise ValueError(
             f"the fields of {SCHEMA_NAME} differ from this version's in {', '.join(differing)}"
@@ -79,79 +78,73 @@ class StepFormat:
     """
 
     def __init__(self, layout: StepLayout) -> None:
-        self._layout = layout
-        self._widths = {name: width for name, width in layout.widths.items() if width}
+        self.layout = layout
         template = bytearray()
         offsets: list[int] = []
         values = np.zeros(0, dtype=bool)  # which bytes of a message hold numbers
-        for number, name in enumerate(layout.widths, start=1):
-            if name not in self._widths:
-                continue
-            prefix, size = _prefix(name, number, layout.widths[name])
-            offsets.append(len(template) + len(prefix))
-            template += prefix + bytes(size)
-            values = np.append(values, [False] * len(prefix) + [True] * size)
+        for number, (name, width) in enumerate(layout.widths.items(), start=1):
+            if width:
+                prefix, size = _prefix(name, number, width)
+                offsets.append(len(template) + len(prefix))
+                template += prefix + bytes(size)
+                values = np.append(values, [False] * len(prefix) + [True] * size)
         self._template = np.frombuffer(bytes(template), dtype=np.uint8)
         self._constant = np.flatnonzero(~values)
-        formats = [_value_type(name, width) for name, width in self._widths.items()]
+        # The same fields twice, so that NumPy copies all of them in one assignment.
+        widths = {name: width for name, width in layout.widths.items() if width}
         self._record = np.dtype(
             {
-                "names": list(self._widths),
-                "formats": formats,
+                "names": list(widths),
+                "formats": [_value_type(name, width) for name, width in widths.items()],
                 "offsets": offsets,
                 "itemsize": len(template),
             }
         )
+        self._row = np.dtype([(name, *_row_type(name, width)) for name, width in widths.items()])
 
     @property
     def size(self) -> int:
         """Bytes of one message."""
         return len(self._template)
 
-    def encode(self, rows: Array) -> list[bytes]:
-        """Rows (N, width), flags 0 or 1, as N messages."""
-        wire = np.tile(self._template, (len(rows), 1))
-        records = wire.view(self._record)[:, 0]
-        for name, where in self._layout.slices.items():
-            if name in self._widths:
-                records[name] = rows[:, where].reshape(records[name].shape)
-        data, size = wire.tobytes(), self.size
-        return [data[k : k + size] for k in range(0, len(data), size)]
+    def encode(self, rows: Array) -> Array:
+        """Rows (N, width), flags 0 or 1, as N messages: their bytes, (N, size)."""
+        wire = np.empty((len(rows), self.size), dtype=np.uint8)
+        wire[:] = self._template
+        wire.view(self._record)[:, 0] = np.ascontiguousarray(rows).view(self._row)[:, 0]
+        return wire
 
-    def decode(self, messages: Sequence[bytes]) -> Array:
-        """N messages as rows (N, width).
+    def decode(self, messages: Array, first: int = 0) -> Array:
+        """Messages of one size as rows (N, width).
+
+        Args:
+            messages: their bytes, (N, size).
+            first: the number of the first of them, for errors.
 
         Raises:
             ValueError: a message is no `dnnmso.Step`, or its vectors have other widths.
         """
-        rows = np.empty((len(messages), self._layout.width))
-        records = self._records(messages)
-        if records is None:
+        rows = np.empty((len(messages), self.layout.width))
+        if self._are_ours(messages):
+            rows.view(self._row)[:, 0] = messages.view(self._record)[:, 0]
+        else:
             for k, message in enumerate(messages):
-                rows[k] = self._parse(message, k)
-            return rows
-        for name, where in self._layout.slices.items():
-            if name in self._widths:
-                rows[:, where] = records[name].reshape(len(messages), self._widths[name])
+                rows[k] = self._parse(message.tobytes(), first + k)
         return rows
 
-    def _records(self, messages: Sequence[bytes]) -> Array | None:
-        """The messages as one structured array, or None when they are not all packed our way."""
-        if any(len(message) != self.size for message in messages):
-            return None
-        wire = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(-1, self.size)
-        if not np.array_equal(
-            wire[:, self._constant],
-            np.broadcast_to(self._template[self._constant], (len(wire), len(self._constant))),
-        ):
-            return None
-        records = wire.view(self._record)[:, 0]
-        return None if any((records[name] > 1).any() for name in FLAGS) else records
+    def _are_ours(self, messages: Array) -> bool:
+        """Whether all are packed our way."""
+        if messages.shape[1] != self.size:
+            return False
+        if (messages[:, self._constant] != self._template[self._constant]).any():
+            return False
+        records = messages.view(self._record)[:, 0]
+        return not any((records[name] > 1).any() for name in FLAGS)
 
     def _parse(self, data: bytes, index: int) -> Array:
         message = _parsed(data, index)
         values: list[float] = []
-        for name, width in self._layout.widths.items():
+        for name, width in self.layout.widths.items():
             value = getattr(message, name)
             entries = [value] if name in SCALARS or name in FLAGS else list(value)
             if len(entries) != width:
@@ -213,3 +206,7 @@ def _value_type(name: str, width: int) -> Any:
     if name in FLAGS:
         return np.uint8
     return "<f8" if name in SCALARS else ("<f8", (width,))
+
+
+def _row_type(name: str, width: int) -> Any:
+    return ("f8",) if name in SCALARS or name in FLAGS else ("f8", (width,))
