@@ -98,8 +98,7 @@ def learn(net: Net, watch: Watch, monitors: Monitors) -> None:
 
 @inner
 def _span(net: Net, layer: int) -> slice:
-    rows = net.sizes[layer] + net.bias
-    return slice(net.starts[layer], net.starts[layer] + rows * net.strides[layer])
+    return slice(net.starts[layer], net.starts[layer + 1])
 
 
 @inner

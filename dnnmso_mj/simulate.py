@@ -46,6 +46,7 @@ Progress = Callable[[int], None]
 
 HEAD_START_NS = 20_000_000  # from a paced run's beginning to its first tick
 BLOCK = 50  # ticks between two looks at the recorder, progress and interrupts
+LARGEST_BLOCK = 250  # where nothing waits for the rows
 CHUNK = 1000  # ticks of the reference sampled at once
 SNAPSHOT_PERIOD = 1.0  # s
 CHANGES = {
@@ -56,7 +57,7 @@ AS_FAST_AS_CAN_BE = Pace(0, 0, 0.0, np.zeros((0, 2), np.int64))
 
 
 class Recorder(Protocol):
-    """Where the rows of a run go."""
+    """Where the rows of a run go; one with an attribute `block` takes that many at once."""
 
     def append(self, rows: Array) -> None:
         """Take some ticks: rows (m, `StepLayout.width`), which are overwritten afterwards."""
@@ -123,7 +124,7 @@ class Simulation:
             tau=np.zeros(n),
             qdd=np.zeros(n),
             L=np.zeros((n, n)),
-            rows=np.zeros((BLOCK, self.layout.width)),
+            rows=np.zeros((LARGEST_BLOCK, self.layout.width)),
             counts=np.zeros(N_COUNTS, np.int64),
             late_ns=np.zeros(1, np.int64),
             timespec=np.zeros(2, np.int64),
@@ -189,6 +190,7 @@ class Simulation:
     def _loop(self, recorder: Recorder, progress: Progress | None) -> None:
         n_ticks, dt = self.scenario.n_ticks, self.scenario.dt
         snapshot_every = max(1, round(SNAPSHOT_PERIOD / dt))
+        block = min(getattr(recorder, "block", BLOCK), LARGEST_BLOCK)
         self.world.counts[START_NS] = time.monotonic_ns() + HEAD_START_NS
         while self._tick < n_ticks:
             first = self._tick
@@ -196,7 +198,7 @@ class Simulation:
                 recorder.snapshot("controller", first * dt, self.controller.state())
             if first % CHUNK == 0 and first > 0:
                 self._sample_reference(first)
-            ends = [first + BLOCK, n_ticks]
+            ends = [first + block, n_ticks]
             ends += [(first // every + 1) * every for every in (CHUNK, snapshot_every)]
             count = min(ends) - first
             self._run_block(first, count, recorder)
@@ -281,6 +283,8 @@ class MemoryRecorder:
         layout: of the rows.
         n_ticks: how many rows there can be.
     """
+
+    block = LARGEST_BLOCK
 
     def __init__(self, layout: StepLayout, n_ticks: int) -> None:
         self._layout = layout

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from dnnmso_mj.clock import now_ns, sleep_until
-from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.compiling import copy, inner
 from dnnmso_mj.imperfections import Actuators, actuate
 from dnnmso_mj.inversion import solve_spd
 from dnnmso_mj.plant import PlantView, forward, integrate, solve_inertia
@@ -218,25 +218,31 @@ def _true_dynamics(world: World, command: Command, tau: Array, substituted: bool
 def fill(world: World, command: Command, k: int, saturated: bool, missed: bool, row: Array) -> None:
     """Tick k as a row, in the order of `StepLayout.widths`."""
     n, monitors = world.tau.size, command.monitors
+    states, torques = 2 * n, 1 + 6 * n
+    learned, layers = torques + 2 * n, monitors.weight_norm.size
     row[0] = k * world.dt
-    at = 1
-    at = _put(row, at, world.x)
-    at = _put(row, at, world.x)  # the sensors are perfect
-    at = _put(row, at, world.x_ref)
-    at = _put(row, at, command.tau)
-    at = _put(row, at, world.actuators.tau)
-    at = _put(row, at, command.x_hat)
-    at = _put(row, at, command.f_hat)
-    at = _put(row, at, world.f_true)
-    at = _put(row, at, command.e_obs)
-    at = _put(row, at, monitors.weight_norm)
-    at = _put(row, at, monitors.update_ratio)
-    at = _put(row, at, monitors.eta_bound)
-    at = _put(row, at, monitors.gradient_change)
-    at = _put(row, at, monitors.drt_bound)
     lyapunov = 0.0
-    for j in range(2 * n):
+    for j in range(states):
+        row[1 + j] = world.x[j]
+        row[1 + states + j] = world.x[j]  # the sensors are perfect
+        row[1 + 2 * states + j] = world.x_ref[j]
+        row[learned + j] = command.x_hat[j]
+        row[learned + states + j] = command.f_hat[j]
+        row[learned + 2 * states + j] = world.f_true[j]
+        row[learned + 3 * states + j] = command.e_obs[j]
         lyapunov += world.e_track[j] ** 2
+    for j in range(n):
+        row[torques + j] = command.tau[j]
+        row[torques + n + j] = world.actuators.tau[j]
+    at = learned + 4 * states
+    for j in range(layers):
+        row[at + j] = monitors.weight_norm[j]
+        row[at + layers + j] = monitors.update_ratio[j]
+        row[at + 2 * layers + j] = monitors.eta_bound[j]
+        row[at + 3 * layers + j] = monitors.gradient_change[j]
+    at += 4 * layers
+    row[at] = monitors.drt_bound[0]
+    at += 1
     row[at] = lyapunov
     row[at + 1] = world.bounds.joint[0]
     row[at + 2] = world.bounds.paper[0]
@@ -245,11 +251,3 @@ def fill(world: World, command: Command, k: int, saturated: bool, missed: bool, 
     row[at + 5] = monitors.clipped[0]
     row[at + 6] = 1.0 if missed else 0.0
     row[at + 7] = world.late_ns[0] * 1e-3
-
-
-@compiled
-def _put(row: Array, at: int, values: Array) -> int:
-    """Copy values into a row from `at` on; where the next ones go."""
-    for j in range(values.size):
-        row[at + j] = values[j]
-    return at + values.size

@@ -20,9 +20,10 @@ from dnnmso_mj.cli.shared import (
     progress_bar,
     working,
 )
-from dnnmso_mj.errors import RunInterrupted, ScenarioError
+from dnnmso_mj.errors import DnnmsoError, RunInterrupted, ScenarioError
 
 if TYPE_CHECKING:
+    from dnnmso_mj.run import LoggedRun
     from dnnmso_mj.timing import Timing
     from dnnmso_mj.trace import Trace
 
@@ -47,7 +48,7 @@ def run(
     overrides: Overrides = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the initial weights.")] = None,
     out: Annotated[Path | None, typer.Option(help="The log; default logs/NAME.mcap.")] = None,
-    force: Annotated[bool, typer.Option(help="Replace an existing --out.")] = False,
+    force: Annotated[bool, typer.Option(help="Replace an existing log.")] = False,
     real_time: Annotated[
         bool, typer.Option("--real-time", help="Keep to the wall clock, one tick each dt.")
     ] = False,
@@ -69,12 +70,7 @@ def run(
     except RunInterrupted as stop:
         ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
         raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
-    figures = []
-    if plot and len(done.trace) > 0:
-        from dnnmso_mj.plots import save_figures
-
-        with working("drawing figures"):
-            figures = save_figures(done.trace, done.log.parent, done.log.stem)
+    figures, undrawn = _draw(done) if plot else ([], None)
     info = done.trace.info
     if as_json:
         print(json.dumps({
@@ -92,9 +88,24 @@ def run(
         _print_summary(done.trace, done.log, figures)
         if real_time:
             _print_timing(timing(done.trace))
+    if undrawn is not None:
+        raise undrawn
     if info.status == "diverged":
         print(f"diverged: {info.reason}", file=sys.stderr)
         raise typer.Exit(DIVERGED)
+
+
+def _draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
+    """The figures beside the log, and why there are none of those that could not be written."""
+    if len(done.trace) == 0:
+        return [], None
+    from dnnmso_mj.plots import save_figures
+
+    try:
+        with working("drawing figures"):
+            return save_figures(done.trace, done.log.parent, done.log.stem), None
+    except DnnmsoError as error:
+        return [], error
 
 
 def _print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
