@@ -6,6 +6,7 @@ reference. A tick is `predict`, then `learn` with the gradient of the loss by th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Protocol
 
@@ -85,7 +86,7 @@ class KernelLearner:
         return self._prediction
 
     def learn(self, delta: Array) -> None:
-        if not np.isfinite(delta).all():
+        if not math.isfinite(delta.sum()):
             raise NonFiniteError("gradient of the output", delta.tolist())
         self._delta[:] = delta
         monitors.learn(self.net, self.watch, self.monitors)

@@ -28,7 +28,7 @@ from dnnmso_mj.metrics import BOUND_MARGIN, BOUND_ROUNDING, compute_metrics
 from dnnmso_mj.monitors import WATCH_EVERY
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
-from dnnmso_mj.scenario import NoNetwork
+from dnnmso_mj.scenario import NoNetwork, Scenario
 from dnnmso_mj.simulate import MemoryRecorder, Simulation
 from dnnmso_mj.trace import Trace
 
@@ -89,10 +89,18 @@ def load_groups() -> dict[str, Group]:
     }
 
 
+def scenario_of(overrides: str, seed: int) -> Scenario:
+    """A variant of scenarios/paper, in float64 unless it says otherwise or has no network."""
+    sets = overrides.split()
+    if "kind=no_network" not in overrides and "network.precision=" not in overrides:
+        sets.append("controller.network.precision=float64")
+    return load_scenario(BASE, [*sets, f"seed={seed}"])
+
+
 def measure(task: Task) -> Measures:
     """Run one variant with one seed, and take everything that any column shows."""
     overrides, seed = task
-    scenario = load_scenario(BASE, [*overrides.split(), f"seed={seed}"])
+    scenario = scenario_of(overrides, seed)
     simulation = Simulation(scenario, Mjcf.read(find_model(scenario.plant.model)))
     recorder = MemoryRecorder(simulation.layout, scenario.n_ticks)
     trace = recorder.trace(scenario, simulation.run(recorder))

@@ -13,7 +13,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.simulate import simulate
 
@@ -36,8 +35,8 @@ VARIANTS = sorted({text for group in GROUPS.values() for text in group.variants.
 
 @pytest.mark.parametrize("overrides", VARIANTS)
 def test_every_variant_is_a_scenario_that_differs_from_the_shipped_one(overrides):
-    changed = load_scenario(ledger.BASE, overrides.split())
-    assert changed != load_scenario(ledger.BASE)
+    changed = ledger.scenario_of(overrides, 0)
+    assert changed != ledger.scenario_of("", 0)
     assert changed.n_ticks * changed.dt >= 10.0
 
 
@@ -57,10 +56,7 @@ def test_a_variant_is_measured_and_makes_a_row_of_its_table():
     table = ledger.section("tiny", group, 3, {task: ledger.measure(task) for task in tasks})
     row = table.splitlines()[-1]
     assert "| `--set duration=0.05 --set 'controller.network.hidden=[5]'` |" in row
-    errors = [
-        compute_metrics(simulate(load_scenario("paper", [*texts.split(), f"seed={seed}"])))
-        for seed in range(3)
-    ]
+    errors = [compute_metrics(simulate(ledger.scenario_of(texts, seed))) for seed in range(3)]
     low, median, high = np.sort([metrics["rmse_steady"] for metrics in errors])
     assert f"| {median:.3g} [{low:.3g}, {high:.3g}] |" in row
     assert row.endswith("| 0 of 3 |")
@@ -95,9 +91,7 @@ def test_the_first_update_is_eta_by_sign_and_bolder_by_one_over_the_root_of_one_
 
 
 def test_without_learning_the_last_weights_know_what_the_live_ones_knew():
-    found = ledger.measure(
-        ("duration=0.2 controller.madam.eta=1e-12 controller.network.precision=float64", 0)
-    )
+    found = ledger.measure(("duration=0.2 controller.madam.eta=1e-12", 0))
     assert found["recall_half"] == pytest.approx(found["f_err_rms_steady"], rel=1e-6)
     learning = ledger.measure(("duration=0.2", 0))
     assert learning["recall_half"] != pytest.approx(learning["f_err_rms_steady"], rel=0.1)
