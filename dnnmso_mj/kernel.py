@@ -13,6 +13,7 @@ of inputs and errors is zero, so it is inert.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,22 @@ SHORT = 0.1  # |exponent| up to which a short polynomial is the exponential
 W_SQ, G_SQ, GW, DW_SQ, CLIPPED = range(5)
 
 
+class Layer(NamedTuple):
+    """Where the numbers of a layer stand; a row of `Net.layers`."""
+
+    n_in: int
+    n_out: int
+    by_output: int  # 1 where a row of weights is a neuron's, 0 where it is an input's
+    stride: int  # padded length of a row
+    start: int  # of its weights
+    end: int
+    at: int  # of its inputs in `acts`, and of the errors passed back to them in `deltas`
+    out: int  # of its outputs and their errors
+
+
+START, END, OUT = (Layer._fields.index(name) for name in ("start", "end", "out"))
+
+
 class Net(NamedTuple):
     """A network and its optimiser, ready for the compiled passes; w to deltas in its precision."""
 
@@ -38,11 +55,7 @@ class Net(NamedTuple):
     v: Array  # their second moments ḡ²
     acts: Array  # every layer's activations, the constant input behind each
     deltas: Array  # ∂loss/∂(input sum) of every layer; the last one is set by the caller
-    sizes: Array  # (L+1,) widths
-    by_output: Array  # (L,) 1 where a row of weights is a neuron's, 0 where it is an input's
-    strides: Array  # (L,) padded lengths of the rows
-    starts: Array  # (L+1,) where a layer's weights begin, and where the last one's end
-    slots: Array  # (L+1,) where a layer's activations and deltas begin
+    layers: Array  # (L, 8) `Layer`s, int64
     madam: Array  # η, η*, σ*, β; float64
     updates: Array  # (1,) number of updates so far
     bias: int  # 1 with a constant input to every layer, else 0
@@ -53,22 +66,14 @@ class Net(NamedTuple):
 def build_net(shape: Shape, weights: Array, spec: MadamSpec) -> Net:
     """A network with the given flat weights (n_weights,), whose precision becomes its own."""
     dtype = weights.dtype
-    by_input = [(n_in, _padded(n_out)) for n_out, n_in in shape.matrices]
-    by_output = [(n_out, _padded(n_in)) for n_out, n_in in shape.matrices]
-    turned = [math.prod(b) < math.prod(a) for a, b in zip(by_input, by_output, strict=True)]
-    stored = np.where(np.array(turned)[:, None], by_output, by_input)  # (L, 2) rows, stride
-    starts = np.concatenate([[0], np.cumsum(stored.prod(axis=1))])
-    slots = np.cumsum([0] + [_padded(size) + LANES for size in shape.sizes])
+    layers = _layers(shape)
+    n_acts = layers[-1].out + _padded(layers[-1].n_out) + LANES
     net = Net(
-        w=np.zeros(starts[-1], dtype),
-        v=np.zeros(starts[-1], dtype),
-        acts=np.zeros(slots[-1], dtype),
-        deltas=np.zeros(slots[-1], dtype),
-        sizes=np.array(shape.sizes),
-        by_output=np.array(turned, int),
-        strides=np.ascontiguousarray(stored[:, 1]),
-        starts=starts,
-        slots=slots[:-1],
+        w=np.zeros(layers[-1].end, dtype),
+        v=np.zeros(layers[-1].end, dtype),
+        acts=np.zeros(n_acts, dtype),
+        deltas=np.zeros(n_acts, dtype),
+        layers=np.array(layers),
         madam=np.array([spec.eta, spec.eta_max, spec.sigma_max, spec.beta]),
         updates=np.zeros(1, int),
         bias=int(shape.bias),
@@ -79,6 +84,21 @@ def build_net(shape: Shape, weights: Array, spec: MadamSpec) -> Net:
     return net
 
 
+def _layers(shape: Shape) -> list[Layer]:
+    """Each layer stored the way that takes less room."""
+    layers: list[Layer] = []
+    start = at = 0
+    for n_in, n_out in pairwise(shape.sizes):
+        inputs = n_in + shape.bias
+        by_input, by_output = inputs * _padded(n_out), n_out * _padded(inputs)
+        turned = by_output < by_input
+        stride, end = _padded(inputs if turned else n_out), start + min(by_input, by_output)
+        out = at + _padded(n_in) + LANES
+        layers.append(Layer(n_in, n_out, int(turned), stride, start, end, at, out))
+        start, at = end, out
+    return layers
+
+
 def _padded(size: int) -> int:
     return -(-size // LANES) * LANES
 
@@ -86,24 +106,30 @@ def _padded(size: int) -> int:
 def pack(net: Net, shape: Shape, flat: Array) -> Array:
     """Flat (n_weights,) values, matrix after matrix as in `Shape`, in the kernel's order."""
     packed = np.zeros_like(net.w)
-    for W, matrix in zip(_layers(net, shape, packed), shape.split(flat), strict=True):
+    for W, matrix in zip(_matrices(shape, packed), shape.split(flat), strict=True):
         W[:] = matrix
     return packed
 
 
 def unpack(net: Net, shape: Shape, packed: Array) -> Array:
     """The inverse of `pack`, as a new array."""
-    return np.concatenate([W.ravel() for W in _layers(net, shape, packed)])
+    return np.concatenate([W.ravel() for W in _matrices(shape, packed)])
 
 
-def _layers(net: Net, shape: Shape, packed: Array) -> list[Array]:
+def _matrices(shape: Shape, packed: Array) -> list[Array]:
     """Views of a packed vector as the layers' matrices (n_out, n_in + bias), without padding."""
     views = []
-    for layer, (n_out, n_in) in enumerate(shape.matrices):
-        start, end = net.starts[layer : layer + 2]
-        rows = packed[start:end].reshape(-1, net.strides[layer])
-        views.append(rows[:, :n_in] if net.by_output[layer] else rows[:, :n_out].T)
+    for layer in _layers(shape):
+        rows = packed[layer.start : layer.end].reshape(-1, layer.stride)
+        inputs = layer.n_in + shape.bias
+        views.append(rows[:, :inputs] if layer.by_output else rows[:, : layer.n_out].T)
     return views
+
+
+@inner
+def output_at(net: Net) -> int:
+    """Where the network's output stands in `acts`, and ∂loss/∂f̂ in `deltas`."""
+    return int(net.layers[-1, OUT])
 
 
 @compiled
@@ -116,21 +142,19 @@ def forward(net: Net, x: Array) -> Array:
 @compiled
 def propagate(net: Net) -> Array:
     """`forward` once more, with the x it had."""
-    acts, n_layers = net.acts, net.strides.size
+    acts, n_layers = net.acts, len(net.layers)
     real = acts.dtype.type
     for layer in range(n_layers):
-        n_in, n_out, stride = net.sizes[layer], net.sizes[layer + 1], net.strides[layer]
-        at, out = net.slots[layer], net.slots[layer + 1]
+        n_in, n_out, by_output, stride, start, end, at, out = net.layers[layer]
         acts[at + n_in] = real(net.bias)
-        W = net.w[net.starts[layer] : net.starts[layer + 1]].reshape(-1, stride)
-        if net.by_output[layer]:
+        W = net.w[start:end].reshape(-1, stride)
+        if by_output:
             _multiply_rows(W, acts[at : at + stride], acts[out : out + n_out])
         else:
             _add_rows(W, acts[at : at + n_in + net.bias], acts[out : out + stride])
         if layer < n_layers - 1:
             _activate(acts[out : out + n_out], net.activation)
-    last = net.slots[n_layers]
-    return acts[last : last + net.sizes[n_layers]]
+    return acts[out : out + n_out]
 
 
 @compiled
@@ -233,20 +257,19 @@ def learn(net: Net) -> None:
 
     The activations are those of the last `forward`; the output's deltas hold ∂loss/∂f̂.
     """
-    real, n_layers = net.w.dtype.type, net.strides.size
+    real = net.w.dtype.type
     eta, eta_max, sigma_max, beta = net.madam
     net.updates[0] += 1
     correction = 1.0 - beta ** net.updates[0] if net.bias_correction else 1.0
     small = math.sqrt((1.0 - beta) / correction)
     fresh, forget, limit = real(math.sqrt(1.0 - beta)), real(beta), real(sigma_max)
     rate, most = real(eta / small), real(eta_max / eta * small)
-    for layer in range(n_layers - 1, -1, -1):
-        n_in, n_out, stride = net.sizes[layer], net.sizes[layer + 1], net.strides[layer]
-        at, out, start = net.slots[layer], net.slots[layer + 1], net.starts[layer]
+    for layer in range(len(net.layers) - 1, -1, -1):
+        n_in, n_out, by_output, stride, start, end, at, out = net.layers[layer]
         delta, back = net.deltas[out : out + stride], net.deltas[at : at + n_in]
-        if net.by_output[layer]:
+        if by_output:
             _pass_back(
-                net.w[start : net.starts[layer + 1]].reshape(-1, stride),
+                net.w[start:end].reshape(-1, stride),
                 net.deltas[out : out + n_out],
                 back,
             )
@@ -267,13 +290,11 @@ def learn(net: Net) -> None:
 @compiled
 def gradient(net: Net, g: Array) -> None:
     """∂loss/∂w into `g`, in the kernel's order and without any update; otherwise as `learn`."""
-    for layer in range(net.strides.size - 1, -1, -1):
-        n_in, n_out, stride = net.sizes[layer], net.sizes[layer + 1], net.strides[layer]
-        at, out = net.slots[layer], net.slots[layer + 1]
-        start, end = net.starts[layer], net.starts[layer + 1]
+    for layer in range(len(net.layers) - 1, -1, -1):
+        n_in, n_out, by_output, stride, start, end, at, out = net.layers[layer]
         W, G = net.w[start:end].reshape(-1, stride), g[start:end].reshape(-1, stride)
         back = net.deltas[at : at + n_in]
-        if net.by_output[layer]:
+        if by_output:
             delta = net.deltas[out : out + n_out]
             _pass_back(W, delta, back)
             _outer(delta, net.acts[at : at + stride], G)

@@ -77,7 +77,7 @@ class KernelLearner:
         self.net = kernel.build_net(shape, weights, spec)
         self.watch = monitors.build_watch(self.net, spec, watch)
         self.monitors = Monitors.zeros(shape.n_layers)
-        out = int(self.net.slots[-1])
+        out = kernel.output_at(self.net)
         self._delta = self.net.deltas[out : out + shape.sizes[-1]]
         self._prediction = np.zeros(shape.sizes[-1])
 

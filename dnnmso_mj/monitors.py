@@ -15,7 +15,7 @@ import numpy as np
 
 from dnnmso_mj import kernel
 from dnnmso_mj.compiling import compiled, copy, inner
-from dnnmso_mj.kernel import CLIPPED, DW_SQ, G_SQ, GW, W_SQ, Net
+from dnnmso_mj.kernel import CLIPPED, DW_SQ, END, G_SQ, GW, START, W_SQ, Net
 from dnnmso_mj.scenario import Madam as MadamSpec
 from dnnmso_mj.theory import layer_monitors
 
@@ -54,7 +54,7 @@ class Watch(NamedTuple):
 def build_watch(net: Net, spec: MadamSpec, on: bool) -> Watch:
     """What `learn` needs to watch a network, or to leave it alone."""
     w, g, g_after = np.zeros((3, net.w.size), net.w.dtype)
-    stats = np.zeros((net.strides.size, 5))
+    stats = np.zeros((len(net.layers), 5))
     return Watch(w, g, g_after, stats, clamp_norm=clamp_norm(spec), never=not on)
 
 
@@ -98,7 +98,7 @@ def learn(net: Net, watch: Watch, monitors: Monitors) -> None:
 
 @inner
 def _span(net: Net, layer: int) -> slice:
-    return slice(net.starts[layer], net.starts[layer + 1])
+    return slice(net.layers[layer, START], net.layers[layer, END])
 
 
 @inner
@@ -107,7 +107,7 @@ def _sum_up(net: Net, watch: Watch) -> None:
     eta, eta_max, sigma_max, beta = net.madam
     correction = 1.0 - beta ** net.updates[0] if net.bias_correction else 1.0
     most_sq = (eta_max / eta) ** 2 / correction
-    for layer in range(net.strides.size):
+    for layer in range(len(net.layers)):
         span, sums = _span(net, layer), watch.stats[layer]
         _sum_layer(watch.w[span], watch.g[span], net.w[span], sums)
         sums[CLIPPED] = _count_clamped(watch.g[span], net.w[span], net.v[span], most_sq, sigma_max)
@@ -138,7 +138,7 @@ def _count_clamped(g: Array, w: Array, v: Array, most_sq: float, sigma_max: floa
 @inner
 def _gradient_change(net: Net, watch: Watch, out: Array) -> None:
     """‖g_l(W+ΔW) − g_l(W)‖/‖g_l(W)‖ (L,); 0 where a layer has no gradient."""
-    for layer in range(net.strides.size):
+    for layer in range(len(net.layers)):
         span = _span(net, layer)
         out[layer] = _turn(watch.g[span], watch.g_after[span])
 

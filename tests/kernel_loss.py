@@ -15,7 +15,7 @@ def loss_and_gradient(
     """ℓ(W) = δᵀ f̂(x; W) and ∂ℓ/∂W (n_weights,)."""
     net = kernel.build_net(shape, w, Madam())
     loss = float(delta @ kernel.forward(net, x))
-    last = net.slots[-1]
+    last = kernel.output_at(net)
     net.deltas[last : last + delta.size] = delta
     g = np.zeros_like(net.w)
     kernel.gradient(net, g)

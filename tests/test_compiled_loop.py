@@ -103,7 +103,7 @@ def test_a_changed_source_is_compiled_anew_though_its_callers_file_is_not(tmp_pa
         "from dnnmso_mj.scenario import Madam\n"
         "shape = Shape((1, 1), bias=False, activation='sigmoid')\n"
         "net = kernel.build_net(shape, np.ones(1), Madam())\n"
-        "kernel.forward(net, np.ones(1)); print(net.acts[net.slots[1]])\n"
+        "kernel.forward(net, np.ones(1)); print(net.acts[kernel.output_at(net)])\n"
     )
 
     def output() -> float:

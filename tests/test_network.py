@@ -139,7 +139,7 @@ def test_signals_keep_their_size_through_the_layers_with_kumars_scale():
     w = initial_weights(shape, Network(hidden=(200,) * 6), np.random.default_rng(1))
     net = kernel.build_net(shape, w, MadamSpec())
     kernel.forward(net, np.random.default_rng(2).normal(size=200))
-    spreads = [net.acts[start : start + 200].std() for start in net.slots[1:7]]
+    spreads = [net.acts[start : start + 200].std() for start in net.layers[:6, kernel.OUT]]
     assert spreads[-1] / spreads[0] > 0.5
 
 

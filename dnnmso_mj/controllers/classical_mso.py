@@ -22,7 +22,7 @@ from dnnmso_mj import monitors
 from dnnmso_mj.compiling import compiled, copy, inner
 from dnnmso_mj.controllers import Command, CompiledTicks, command_of
 from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert, solve_spd
-from dnnmso_mj.kernel import Net, forward
+from dnnmso_mj.kernel import Net, forward, output_at
 from dnnmso_mj.learner import KernelLearner, build_learner
 from dnnmso_mj.monitors import Watch
 from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
@@ -156,7 +156,7 @@ def update(parts: LearningParts, x: Array, x_ref: Array, xd_ref: Array) -> None:
     """One tick of the law above."""
     law, net = parts.law, parts.net
     command_with(law, forward(net, x), x, x_ref, xd_ref)
-    delta = net.slots[net.strides.size]
+    delta = output_at(net)
     for i in range(law.delta.size):
         net.deltas[delta + i] = law.delta[i]
     monitors.learn(net, parts.watch, law.command.monitors)

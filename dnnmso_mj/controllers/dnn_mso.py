@@ -18,7 +18,7 @@ from dnnmso_mj import monitors
 from dnnmso_mj.compiling import compiled, copy, inner
 from dnnmso_mj.controllers import Command, CompiledTicks, command_of
 from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert
-from dnnmso_mj.kernel import Net, forward
+from dnnmso_mj.kernel import Net, forward, output_at
 from dnnmso_mj.learner import KernelLearner, build_learner
 from dnnmso_mj.monitors import Watch
 from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
@@ -124,7 +124,7 @@ def update(parts: Parts, x: Array, x_ref: Array, xd_ref: Array) -> None:
     for i in range(output.size):
         command.f_hat[known + i] = output[i]
     invert(parts.inversion, x, x_ref, xd_ref, command.f_hat)
-    delta = net.slots[net.strides.size]
+    delta = output_at(net)
     for i in range(output.size):
         net.deltas[delta + i] = -observer.e_obs[known + i]
     monitors.learn(net, parts.watch, command.monitors)
