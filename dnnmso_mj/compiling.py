@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
-from numba import njit
+from numba import config, njit
 from numba.core import event
+
+from dnnmso_mj.errors import DnnmsoError
 
 Array = np.ndarray
 F = TypeVar("F", bound=Callable[..., Any])
@@ -43,6 +45,8 @@ def inner(function: F) -> F:
 
 
 def _compile(function: F, inline: Literal["always", "never"]) -> F:
+    if getattr(config, "DISABLE_JIT", 0):
+        raise DnnmsoError("NUMBA_DISABLE_JIT is set, and the loop only runs compiled; unset it")
     dispatcher: Any = njit(
         cache=True,
         nogil=True,
@@ -51,8 +55,9 @@ def _compile(function: F, inline: Literal["always", "never"]) -> F:
         # Reassociation lets sums vectorise; NaN and infinity keep their meaning, to be caught.
         fastmath={"reassoc", "contract", "arcp", "nsz"},
     )(function)
-    # Code on disk is valid for these sources; numba would look at the function's own file alone.
-    dispatcher._cache._cache_file._source_stamp = _SOURCES
+    # Code on disk is valid for these sources too; numba looks at the function's own file alone.
+    on_disk = dispatcher._cache._cache_file
+    on_disk._source_stamp = (_SOURCES, on_disk._source_stamp)
     return cast(F, dispatcher)
 
 

@@ -19,6 +19,7 @@ def contradictions(scenario: Scenario) -> list[Problem]:
         *_step_count(scenario),
         *_times_below_dt(scenario),
         *_observer_gain(scenario),
+        *_stalls(scenario),
         *_sizes(scenario),
     ]
 
@@ -53,6 +54,15 @@ def _observer_gain(scenario: Scenario) -> Iterator[Problem]:
     if max(scenario.controller.observer.K2) >= most:
         problem = f"makes a sampled observer unstable; allowed: K2 < 2/dt = {most:g}"
         yield "controller.observer.K2", problem
+
+
+def _stalls(scenario: Scenario) -> Iterator[Problem]:
+    for k, stall in enumerate(scenario.real_time.stalls):
+        if stall.at > scenario.duration - 0.5 * scenario.dt:
+            yield (
+                f"real_time.stalls.{k}.at",
+                f"is at the end or after it; allowed: below {scenario.duration:g} s",
+            )
 
 
 def _sizes(scenario: Scenario) -> Iterator[Problem]:

@@ -28,9 +28,6 @@ ACTIVATIONS: dict[Activation, int] = {"sigmoid": 0, "tanh": 1, "relu": 2}
 LANES = 16  # padding of a layer's width: one 512-bit register of float32
 SHORT = 0.1  # |exponent| up to which a short polynomial is the exponential
 
-# Columns of `stats`, a row for each layer.
-W_SQ, G_SQ, GW, DW_SQ, CLIPPED = range(5)
-
 
 class Layer(NamedTuple):
     """Where the numbers of a layer stand; a row of `Net.layers`."""

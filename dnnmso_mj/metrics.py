@@ -35,7 +35,7 @@ def compute_metrics(trace: Trace) -> Metrics:
         bound_violations: see `bound_violations` (ticks).
         diverged: whether the run was stopped because it left the plausible range.
         compute_us_p50, compute_us_p999: percentiles 50 and 99.9 of the controller's time (µs).
-        deadline_misses: ticks whose controller took longer than a period.
+        deadline_misses: ticks without a command in time, whatever the cause; see `timing`.
 
         None stands for what is not defined: too few ticks, or a column that is not finite.
     """

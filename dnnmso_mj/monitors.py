@@ -15,9 +15,9 @@ import numpy as np
 
 from dnnmso_mj import kernel
 from dnnmso_mj.compiling import compiled, copy, inner
-from dnnmso_mj.kernel import CLIPPED, DW_SQ, END, G_SQ, GW, START, W_SQ, Net
+from dnnmso_mj.kernel import END, START, Net
 from dnnmso_mj.scenario import Madam as MadamSpec
-from dnnmso_mj.theory import layer_monitors
+from dnnmso_mj.theory import CLIPPED, DW_SQ, G_SQ, GW, W_SQ, layer_monitors
 
 Array = np.ndarray
 

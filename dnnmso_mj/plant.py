@@ -297,7 +297,7 @@ class NominalModel:
         effectiveness = scenario.controller.inversion.effectiveness
         known = effectiveness if isinstance(effectiveness, Inertia) else None
         self.model = deepcopy(_nominal_model(scenario.plant, known, scenario.dt, mjcf))
-        data = mujoco.MjData(self.model)
+        data = self._data = mujoco.MjData(self.model)
         self.view = Nominal(
             model=self.model._address,
             data=data._address,

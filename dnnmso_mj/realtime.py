@@ -31,7 +31,7 @@ _SET_TIMER_SLACK = 29  # PR_SET_TIMERSLACK of Linux's <sys/prctl.h>
 def real_time_pace(scenario: Scenario) -> Pace:
     """Pace of one simulated second a second, with the scenario's watchdog and stalls."""
     spec, dt = scenario.real_time, scenario.dt
-    stalls = [(round(stall.at / dt), round(stall.duration * 1e9)) for stall in spec.stalls]
+    stalls = sorted((round(stall.at / dt), round(stall.duration * 1e9)) for stall in spec.stalls)
     return Pace(
         period_ns=round(dt * 1e9),
         watchdog=WATCHDOGS[spec.watchdog],

@@ -402,7 +402,7 @@ class RealTime(Strict):
     damping: NonNegative = 5.0
     """Of the damped watchdog (N·m·s/rad)."""
     stalls: Annotated[tuple[Stall, ...], BeforeValidator(_tuple)] = ()
-    """Hangs of the controller, put in on purpose."""
+    """Hangs of the controller, put in on purpose; each at the first update from its time on."""
 
 
 class Scenario(Strict):

@@ -17,13 +17,14 @@ from dnnmso_mj.compiling import CompileNotice
 from dnnmso_mj.controllers import Controller, build_controller, compiled_ticks
 from dnnmso_mj.errors import NonFiniteError
 from dnnmso_mj.imperfections import build_actuators
-from dnnmso_mj.plant import RK4, Mjcf, Plant
+from dnnmso_mj.plant import RK4, Mjcf, NominalModel, Plant
 from dnnmso_mj.reference import Reference
-from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.scenario import Constant, Scenario
 from dnnmso_mj.theory import build_bounds, start_bounds
 from dnnmso_mj.tick import (
     CHUNK_START,
     DIVERGED_ABOVE,
+    MISSED,
     MUJOCO_ZEROES_ABOVE,
     N_COUNTS,
     OUT_OF_RANGE,
@@ -99,6 +100,8 @@ class Simulation:
         self.controller = controller or build_controller(scenario, mjcf, watch=watch)
         self.layout = StepLayout(n, self.controller.n_layers)
         self._columns = {name: self.layout.slices[name].start for name in CHANGES}
+        self._nominal = NominalModel(scenario, mjcf)
+        effectiveness = scenario.controller.inversion.effectiveness
         bounds = build_bounds(
             scenario.controller.inversion,
             n,
@@ -124,6 +127,8 @@ class Simulation:
             tau=np.zeros(n),
             qdd=np.zeros(n),
             L=np.zeros((n, n)),
+            nominal=self._nominal.view,
+            b=effectiveness.b if isinstance(effectiveness, Constant) else 0.0,
             rows=np.zeros((LARGEST_BLOCK, self.layout.width)),
             counts=np.zeros(N_COUNTS, np.int64),
             late_ns=np.zeros(1, np.int64),
@@ -131,6 +136,7 @@ class Simulation:
             dt=scenario.dt,
         )
         self._flags = dict.fromkeys(CHANGES, False)
+        self._first_state: dict[str, Array] | None = None
 
     def run(self, recorder: Recorder, progress: Progress | None = None) -> RunInfo:
         """Run the scenario from its start to its end, or to its divergence.
@@ -162,6 +168,10 @@ class Simulation:
 
     def _prepare(self) -> None:
         """Load or compile what ticks need, so that none of them pays for it; go to the start."""
+        if self._first_state is None:
+            self._first_state = self.controller.state()
+        else:
+            self.controller.restore(self._first_state)
         with event.install_listener("numba:compile", CompileNotice()):
             if self._ticks is not None:
                 self._ticks.run(self.world, self._ticks.parts, 0, 0)
@@ -248,10 +258,11 @@ class Simulation:
         """The quantity that a tick found wrong, and its value."""
         counts, world = self.world.counts, self.world
         tau = world.actuators.tau.tolist()
+        name = "the watchdog's tau" if counts[MISSED] else "tau"
         if counts[STATUS] == TAU_NOT_FINITE:
-            return NonFiniteError("tau", tau)
+            return NonFiniteError(name, tau)
         if counts[STATUS] == TAU_TOO_LARGE:
-            return NonFiniteError("tau", f"{tau}, above {MUJOCO_ZEROES_ABOVE:g}")
+            return NonFiniteError(name, f"{tau}, above {MUJOCO_ZEROES_ABOVE:g}")
         out_of_range = counts[STATUS] == OUT_OF_RANGE
         self._tick -= 1 if out_of_range else 0  # such a row is recorded
         row = world.rows[counts[ROWS] - (1 if out_of_range else 0)]

@@ -26,11 +26,13 @@ import numpy as np
 
 from dnnmso_mj.compiling import compiled, copy, inner
 from dnnmso_mj.inversion import slack_coupling, slack_matrix
-from dnnmso_mj.kernel import CLIPPED, DW_SQ, G_SQ, GW, W_SQ
 from dnnmso_mj.scenario import Inversion as InversionSpec
 from dnnmso_mj.scenario import expand
 
 Array = np.ndarray
+
+# Columns of the sums over a layer of one update.
+W_SQ, G_SQ, GW, DW_SQ, CLIPPED = range(5)
 
 UNDEFINED = -1.0  # logged where a bound does not exist for the gains in use
 
@@ -39,7 +41,7 @@ UNDEFINED = -1.0  # logged where a bound does not exist for the gains in use
 def layer_monitors(
     stats: Array, weight_norm: Array, update_ratio: Array, eta_bound: Array
 ) -> tuple[float, float]:
-    """Per-layer monitors of one update, from the sums that `kernel.learn` leaves.
+    """Per-layer monitors of one update, from the sums of `monitors`.
 
     Args:
         stats: (L, 5) sums of Σw², Σg², Σ|g||w|, ΣΔw² and clamped updates.
@@ -69,8 +71,8 @@ def layer_monitors(
 class TrackingBounds(NamedTuple):
     """Live bounds on the tracking error, driven by the true f̃.
 
-    For each control period: `begin` with what acts when the torque is set, `end` with what has
-    become of it just before the next torque.
+    For each control period: `begin_period` with what acts when the torque is set, `end_period` with
+    what has become of it just before the next torque.
     """
 
     joint: Array  # (1,) bound on every |q_i − q_ref,i| (rad), or −1 where K or Λ is not scalar
@@ -115,41 +117,54 @@ def start_bounds(bounds: TrackingBounds, e_track: Array) -> None:
 
 
 @inner
-def begin_period(bounds: TrackingBounds, f_err: Array, qdd: Array) -> None:
-    """A period begins in which f̃ (2n,) acts, torque saturation included, and the arm has q̈ (n,)."""
-    n, lam = qdd.size, bounds.gains[1]
-    d_sq = f_sq = 0.0
-    for i in range(n):
-        d_sq += (lam * f_err[i] + f_err[n + i]) ** 2
-        f_sq += f_err[i] ** 2 + f_err[n + i] ** 2
-    bounds.norms[0], bounds.norms[1] = math.sqrt(d_sq), math.sqrt(f_sq)
+def begin_period(
+    bounds: TrackingBounds, f_err: Array, e_track: Array, qdd: Array, qdd_ref: Array
+) -> None:
+    """A period begins with f̃ (2n,) at e_r (2n,), with q̈ (n,) under the torque that is applied."""
+    f_sq = 0.0
+    for i in range(f_err.size):
+        f_sq += f_err[i] ** 2
+    bounds.norms[0] = _disturbance(bounds, e_track, qdd, qdd_ref)
+    bounds.norms[1] = math.sqrt(f_sq)
     copy(qdd, bounds.qdd)
+
+
+@inner
+def _disturbance(bounds: TrackingBounds, e_track: Array, qdd: Array, qdd_ref: Array) -> float:
+    """‖d‖ with d = ṡ + K s = ë + (K + λ) ė + Kλ e.
+
+    That is f̃₂ + λ f̃₁ where the law commands, and holds too where a torque limit or the watchdog
+    acts instead.
+    """
+    n, d_sq = qdd.size, 0.0
+    K, lam = bounds.gains
+    for i in range(n):
+        edd = qdd[i] - qdd_ref[i]
+        d_sq += (edd + (K + lam) * e_track[n + i] + K * lam * e_track[i]) ** 2
+    return math.sqrt(d_sq)
 
 
 @inner
 def end_period(bounds: TrackingBounds, e_track: Array, qdd: Array, qdd_ref: Array) -> None:
     """The period ends at e_r (2n,), with q̈ (n,) rad/s² under the torque that was held.
 
-    There d = ë + (K + λ) ė + Kλ e, by the definition of s alone; ‖d‖ in between is at most the mean
-    of both ends, but for terms of order dt².
+    ‖d‖ in between is at most the mean of both ends, but for terms of order dt².
     """
     bounds.paper[0] = bounds.holds[2, 0] * bounds.paper[0] + bounds.holds[2, 1] * bounds.norms[1]
     if bounds.joint[0] == UNDEFINED:
         return
     n, dt = qdd.size, bounds.dt
-    K, lam = bounds.gains
-    d_sq = q_slip_sq = v_slip_sq = 0.0
+    q_slip_sq = v_slip_sq = 0.0
     for i in range(n):
-        edd = qdd[i] - qdd_ref[i]
-        d_sq += (edd + (K + lam) * e_track[n + i] + K * lam * e_track[i]) ** 2
         q_slip_sq += (0.5 * dt * dt * bounds.qdd[i]) ** 2
         v_slip_sq += (0.5 * dt * (qdd[i] - bounds.qdd[i])) ** 2
     s_before = bounds.s[0]
     s = bounds.holds[0, 0] * s_before
-    s += bounds.holds[0, 1] * 0.5 * (bounds.norms[0] + math.sqrt(d_sq))
+    d_norm = _disturbance(bounds, e_track, qdd, qdd_ref)
+    s += bounds.holds[0, 1] * 0.5 * (bounds.norms[0] + d_norm)
     joint = bounds.holds[1, 0] * bounds.joint[0]
     if bounds.first_order:
-        s += math.sqrt(v_slip_sq) + lam * math.sqrt(q_slip_sq)
+        s += math.sqrt(v_slip_sq) + bounds.gains[1] * math.sqrt(q_slip_sq)
         joint += math.sqrt(q_slip_sq)
     bounds.s[0] = s
     bounds.joint[0] = joint + bounds.holds[1, 1] * max(s, s_before)

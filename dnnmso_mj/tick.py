@@ -19,7 +19,7 @@ from dnnmso_mj.clock import now_ns, sleep_until
 from dnnmso_mj.compiling import copy, inner
 from dnnmso_mj.imperfections import Actuators, actuate
 from dnnmso_mj.inversion import solve_spd
-from dnnmso_mj.plant import PlantView, forward, integrate, solve_inertia
+from dnnmso_mj.plant import Nominal, PlantView, forward, inertia, integrate, solve_inertia
 from dnnmso_mj.theory import TrackingBounds, begin_period, end_period
 
 if TYPE_CHECKING:
@@ -35,8 +35,8 @@ MUJOCO_ZEROES_ABOVE = 1e9  # N·m; from 1e10 on MuJoCo drops a torque with a mer
 RUNNING, TAU_NOT_FINITE, TAU_TOO_LARGE, ROW_NOT_FINITE, OUT_OF_RANGE = range(5)
 
 # Slots of `World.counts`.
-STATUS, ROWS, CHUNK_START, START_NS, CONTROLLED, STARTED_NS, TOOK_NS = range(7)
-N_COUNTS = 7
+STATUS, ROWS, CHUNK_START, START_NS, CONTROLLED, MISSED, STALLS, STARTED_NS, TOOK_NS = range(9)
+N_COUNTS = 9
 
 # What acts on a joint whose command came too late.
 HOLD, ZERO, DAMPED = range(3)
@@ -48,7 +48,7 @@ class Pace(NamedTuple):
     period_ns: int  # 0: not at all, as fast as can be
     watchdog: int  # HOLD, ZERO or DAMPED
     damping: float  # N·m·s/rad, of DAMPED
-    stalls: Array  # (m, 2) int64: tick and ns, where the controller is made to hang
+    stalls: Array  # (m, 2) int64: ticks in order and ns, where the controller is made to hang
 
 
 class World(NamedTuple):
@@ -70,6 +70,8 @@ class World(NamedTuple):
     tau: Array  # (n,) applied in the last period
     qdd: Array  # (n,) scratch
     L: Array  # (n, n) scratch
+    nominal: Nominal  # what the controller takes for the robot: B₂ = M(q)⁻¹,
+    b: float  # or b·I where this is positive
     rows: Array  # (block, width): `trace.StepLayout`
     counts: Array  # int64, see above
     late_ns: Array  # (1,) int64, of this tick's wake-up
@@ -123,6 +125,7 @@ def _wait(world: World, k: int) -> bool:
 def end_tick(world: World, command: Command, k: int) -> bool:
     """Apply the command, record tick k and step the arm; True where the run must end."""
     missed = world.pace.period_ns > 0 and _too_late(world, k)
+    world.counts[MISSED] = 1 if missed else 0
     wanted = _watchdog(world) if missed else command.tau
     saturated = actuate(world.actuators, wanted)
     tau = world.actuators.tau
@@ -150,7 +153,8 @@ def end_tick(world: World, command: Command, k: int) -> bool:
         if max(abs(world.x[j]), abs(command.x_hat[j])) > DIVERGED_ABOVE:
             world.counts[STATUS] = OUT_OF_RANGE
             return True
-    begin_period(world.bounds, world.f_err, world.plant.qacc)
+    qdd_ref = world.xd_ref[tau.size :]
+    begin_period(world.bounds, world.f_err, world.e_track, world.plant.qacc, qdd_ref)
     copy(tau, world.tau)
     integrate(world.plant)
     return False
@@ -162,10 +166,11 @@ def _too_late(world: World, k: int) -> bool:
     pace = world.pace
     if world.counts[CONTROLLED] == 0:
         return True
-    for stall in pace.stalls:
-        if stall[0] == k:
-            sleep_until(now_ns(world.timespec) + stall[1], world.timespec)
-            world.counts[TOOK_NS] += stall[1]
+    while world.counts[STALLS] < len(pace.stalls) and pace.stalls[world.counts[STALLS], 0] <= k:
+        hang = pace.stalls[world.counts[STALLS], 1]
+        sleep_until(now_ns(world.timespec) + hang, world.timespec)
+        world.counts[TOOK_NS] += hang
+        world.counts[STALLS] += 1
     due = world.counts[START_NS] + k * pace.period_ns
     return bool(now_ns(world.timespec) > due + pace.period_ns)
 
@@ -198,6 +203,17 @@ def _end_period(world: World, tau: Array) -> None:
 
 
 @inner
+def _effect(world: World, tau: Array, out: Array) -> None:
+    """B₂ τ (n,) for the B₂ that the controller believes, at the present state."""
+    if world.b > 0.0:
+        for j in range(tau.size):
+            out[j] = world.b * tau[j]
+    else:
+        inertia(world.nominal, world.x[: tau.size])
+        solve_spd(world.nominal.M, tau, out, world.L)
+
+
+@inner
 def _true_dynamics(world: World, command: Command, tau: Array, substituted: bool) -> None:
     """f_true = Ẋ − B τ, and what the closed loop feels of it, f_err = Ẋ − B τ_cmd − f̂."""
     n = tau.size
@@ -206,7 +222,7 @@ def _true_dynamics(world: World, command: Command, tau: Array, substituted: bool
     for j in range(2 * n):
         world.f_err[j] = world.f_true[j] - command.Bu[j] - command.f_hat[j]
     if substituted:
-        solve_spd(command.B2_inv, tau, world.qdd, world.L)
+        _effect(world, tau, world.qdd)
         for j in range(n):
             world.f_true[n + j] -= world.qdd[j]
     else:

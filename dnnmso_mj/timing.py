@@ -37,7 +37,7 @@ def timing(trace: Trace) -> Timing:
     """How a paced run kept its deadlines.
 
     A row of misses is caused by its first tick: by computing if that tick's update took longer than
-    what its wake-up had left of the period, else by waking.
+    the tick had been woken late, else by waking.
     """
     updated = trace["compute_us"] > 0.0
     return Timing(

@@ -8,12 +8,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from dnnmso_mj.errors import MissingExtraError, NonFiniteError
-from dnnmso_mj.kernel import DW_SQ, G_SQ, GW, W_SQ
 from dnnmso_mj.learner import held, hold
 from dnnmso_mj.monitors import WATCH_EVERY, Monitors, clamp_norm, is_due
 from dnnmso_mj.network import Shape, TorchNetwork
 from dnnmso_mj.scenario import Madam as MadamSpec
-from dnnmso_mj.theory import layer_monitors
+from dnnmso_mj.theory import DW_SQ, G_SQ, GW, W_SQ, layer_monitors
 
 Array = np.ndarray
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -117,3 +118,44 @@ def test_a_changed_source_is_compiled_anew_though_its_callers_file_is_not(tmp_pa
     assert "out[i] = values[i]" in text
     copying.write_text(text.replace("out[i] = values[i]", "out[i] = 2.0 * values[i]"))
     assert output() == 2.0
+
+
+def test_a_users_own_compiled_function_is_compiled_anew_when_its_file_changes(tmp_path):
+    own = tmp_path / "own.py"
+    text = (
+        "from dnnmso_mj.compiling import compiled\n\n@compiled\ndef gain(x):\n    return 1.0 * x\n"
+    )
+
+    def gain() -> float:
+        command = [sys.executable, "-c", "import own; print(own.gain(2.0))"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        return float(done.stdout)
+
+    own.write_text(text)
+    assert gain() == 2.0
+    own.write_text(text.replace("1.0", "25.0"))
+    assert gain() == 50.0
+
+
+def test_a_simulation_run_twice_is_the_same_run(make_scenario, two_link):
+    scenario = make_scenario(duration=0.3)
+    simulation = Simulation(scenario, two_link)
+    traces = []
+    for _ in range(2):
+        recorder = MemoryRecorder(simulation.layout, scenario.n_ticks)
+        traces.append(recorder.trace(scenario, simulation.run(recorder)))
+    for name in set(traces[0]) - CLOCKED:
+        assert np.array_equal(traces[0][name], traces[1][name]), name
+
+
+def test_without_compilation_one_line_says_so():
+    command = [sys.executable, "-m", "dnnmso_mj", "run", "paper"]
+    done = subprocess.run(
+        command,
+        env=os.environ | {"NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: NUMBA_DISABLE_JIT is set")

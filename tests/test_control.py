@@ -280,7 +280,8 @@ def test_bound_settles_at_epsilon_over_k_lambda():
     bounds = started_bounds(Inversion(K=[K], lam=lam), dt, np.array([0.5, 0.0]))
     assert bounds.joint[0] == 0.5
     for _ in range(5000):
-        begin_period(bounds, np.array([0.1, eps - lam * 0.1]), np.zeros(1))  # f̃₂ + λ f̃₁ = ε
+        f_err = np.array([0.1, eps - lam * 0.1])  # f̃₂ + λ f̃₁ = ε
+        begin_period(bounds, f_err, np.zeros(2), np.array([eps]), np.zeros(1))
         end_period(bounds, np.zeros(2), np.array([eps]), np.zeros(1))
     assert bounds.joint[0] == pytest.approx(eps / (K * lam), rel=1e-8)
     assert bounds.paper[0] == pytest.approx(np.hypot(0.1, 0.1) / K, rel=1e-9)
@@ -294,7 +295,7 @@ def test_bound_is_reached_by_the_worst_disturbance_and_never_passed():
     ratios = []
     for _ in range(20_000):
         edd = d - (K + lam) * ed - K * lam * e
-        begin_period(bounds, np.array([0.0, d]), np.array([edd]))
+        begin_period(bounds, np.array([0.0, d]), np.array([e, ed]), np.array([edd]), np.zeros(1))
         e, ed = e + dt * ed + 0.5 * dt**2 * edd, ed + dt * edd
         edd = d - (K + lam) * ed - K * lam * e
         end_period(bounds, np.array([e, ed]), np.array([edd]), np.zeros(1))
@@ -306,7 +307,7 @@ def test_bound_is_reached_by_the_worst_disturbance_and_never_passed():
 def test_bound_is_undefined_for_gains_that_are_not_scalar():
     for spec in (Inversion(K=[1.0, 2.0]), Inversion(slack_matrix=[[1.0], [-2.0]], K=[1.0, 2.0])):
         bounds = started_bounds(spec, 1e-3, np.zeros(2))
-        begin_period(bounds, np.ones(2), np.ones(1))
+        begin_period(bounds, np.ones(2), np.ones(2), np.ones(1), np.zeros(1))
         end_period(bounds, np.ones(2), np.ones(1), np.zeros(1))
         assert bounds.joint[0] == UNDEFINED
         assert bounds.paper[0] > 0
@@ -315,7 +316,7 @@ def test_bound_is_undefined_for_gains_that_are_not_scalar():
 def test_without_slack_coupling_the_joint_bound_integrates_s():
     """λ = 0: no position feedback, |e| ≤ |e₀| + ∫|s|."""
     bounds = started_bounds(Inversion(lam=0.0), 0.01, np.array([0.2, 1.0]))
-    begin_period(bounds, np.zeros(2), np.zeros(1))
+    begin_period(bounds, np.zeros(2), np.zeros(2), np.zeros(1), np.zeros(1))
     end_period(bounds, np.zeros(2), np.zeros(1), np.zeros(1))
     assert bounds.joint[0] == pytest.approx(0.2 + 0.01 * 1.0)
 
@@ -327,7 +328,7 @@ def test_bound_adds_what_a_first_order_integrator_slips():
         for flag in (False, True)
     )
     for bounds in (exact, slipping):
-        begin_period(bounds, np.zeros(2), np.array([3.0]))
+        begin_period(bounds, np.zeros(2), np.zeros(2), np.array([3.0]), np.array([3.0]))
         end_period(bounds, np.zeros(2), np.array([5.0]), np.array([5.0]))
     assert exact.joint[0] == exact.s[0] == 0.0
     assert slipping.s[0] == pytest.approx(0.5 * 0.01 * 2.0)

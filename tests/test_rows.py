@@ -36,7 +36,7 @@ def test_papers_bound_starts_at_the_error_and_follows_its_equation(make_scenario
 def test_papers_bound_uses_the_smallest_eigenvalue_of_k():
     bounds = build_bounds(Inversion(K=[1.0, 9.0]), 1, 0.1, first_order=False)
     start_bounds(bounds, np.array([3.0, 4.0]))
-    begin_period(bounds, np.zeros(2), np.zeros(1))
+    begin_period(bounds, np.zeros(2), np.zeros(2), np.zeros(1), np.zeros(1))
     end_period(bounds, np.zeros(2), np.zeros(1), np.zeros(1))
     assert bounds.paper[0] == pytest.approx(5.0 * np.exp(-0.1))
 

@@ -26,7 +26,6 @@ class Command(NamedTuple):
 
     tau: Array  # torque (n,) N·m
     Bu: Array  # B τ (2n,): the effect of `tau` as the controller sees it
-    B2_inv: Array  # (n, n): another torque's effect is [0; B2_inv⁻¹ τ]
     x_hat: Array  # observer state X̂ (2n,) that e_obs was taken from
     f_hat: Array  # learned (or known) dynamics f̂ (2n,)
     e_obs: Array  # observer error X − X̂ (2n,)
@@ -39,7 +38,6 @@ def command_of(inversion: DynamicInversion, e_obs: Array, monitors: Monitors) ->
     return Command(
         tau=inversion.tau,
         Bu=inversion.Bu,
-        B2_inv=inversion.B2_inv,
         x_hat=x_hat,
         f_hat=f_hat,
         e_obs=e_obs,
