@@ -5,7 +5,8 @@ from __future__ import annotations
 import gc
 import io
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -128,22 +129,55 @@ def _require_ticks(runs: Mapping[str, Trace]) -> None:
 
 
 def _save(figures: Mapping[Path, Figure]) -> list[Path]:
-    """Write each figure beside its place, and only then move it there."""
+    """Write each figure beside its place, and only then move it there; half in a second process."""
+    items = list(figures.items())
+    mine, others = items[1::2], items[::2]
     failed: dict[Path, OSError] = {}
-    for path, figure in figures.items():
+    with _drawn_beside(others) as drawn:
+        failed |= _write(mine)
+    if not drawn():
+        failed |= _write(others)
+    if failed:
+        names = ", ".join(str(path) for path in figures if path in failed)
+        reason = next(iter(failed.values())).strerror
+        raise DnnmsoError(
+            f"cannot write figure {names}: {reason}; choose a folder that can be written"
+        )
+    return list(figures)
+
+
+@contextmanager
+def _drawn_beside(items: Sequence[tuple[Path, Figure]]) -> Iterator[Callable[[], bool]]:
+    """Write figures in a forked process meanwhile; afterwards the value says whether it did.
+
+    A process with more threads than this one cannot be forked safely, and draws alone.
+    """
+    child = 0
+    if threading.active_count() == 1 and (os.cpu_count() or 1) > 1 and hasattr(os, "fork"):
+        child = os.fork()
+        if child == 0:
+            status = 1
+            with suppress(BaseException):
+                status = 1 if _write(items) else 0
+            os._exit(status)
+    done = False
+    try:
+        yield lambda: done
+    finally:
+        done = child > 0 and os.waitpid(child, 0)[1] == 0
+
+
+def _write(items: Sequence[tuple[Path, Figure]]) -> dict[Path, OSError]:
+    """Draw and write figures; those that could not be written, and why."""
+    failed: dict[Path, OSError] = {}
+    for path, figure in items:
         with house_style():
             png = _png(figure)
         try:
             _replace(path, png)
         except OSError as error:
             failed[path] = error
-    if failed:
-        names = ", ".join(str(path) for path in failed)
-        reason = next(iter(failed.values())).strerror
-        raise DnnmsoError(
-            f"cannot write figure {names}: {reason}; choose a folder that can be written"
-        )
-    return list(figures)
+    return failed
 
 
 def _replace(path: Path, data: bytes) -> None:
