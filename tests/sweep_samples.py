@@ -74,6 +74,13 @@ def dnnmso(*args: object, cwd: Path, **options: Any) -> subprocess.CompletedProc
     )
 
 
+def foreign_modules(folder: Path) -> None:
+    """Put modules into `folder` that end the process that imports one of them."""
+    (folder / "dnnmso_mj").mkdir()
+    for name in ("dnnmso_mj/__init__.py", "random.py"):
+        (folder / name).write_text("raise SystemExit('foreign code')")
+
+
 def rows_in(journal: Path) -> int:
     """Whole rows that a journal holds."""
     return max(0, journal.read_bytes().count(b"\n") - 1) if journal.exists() else 0

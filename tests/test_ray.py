@@ -10,7 +10,15 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from sweep_samples import DEADLY_SEED, Deadly, dnnmso, small_plan, untimed, with_scenario
+from sweep_samples import (
+    DEADLY_SEED,
+    Deadly,
+    dnnmso,
+    foreign_modules,
+    small_plan,
+    untimed,
+    with_scenario,
+)
 
 from dnnmso_mj.errors import DnnmsoError
 from dnnmso_mj.sweep import on_ray
@@ -28,7 +36,7 @@ def cluster() -> Iterator[object]:
 
     before = os.environ.get("PYTHONPATH", "")
     # Nodes find this folder's modules, as they would an installed package.
-    os.environ["PYTHONPATH"] = f"{Path(__file__).parent}:{before}"
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(Path(__file__).parent), before]))
     cluster = Cluster()
     try:
         cluster.add_node(num_cpus=0, include_dashboard=False)
@@ -103,6 +111,7 @@ def test_every_row_is_there_although_a_node_is_killed_in_mid_sweep(cluster, tmp_
 
 
 def test_the_command_starts_ray_by_itself_and_prints_nothing_else(tmp_path):
+    foreign_modules(tmp_path)  # which no worker shall import
     args = ("sweep", "paper", "--seeds", "0:4", "--set", "duration=0.1", "--out", "x.parquet")
     done = dnnmso(*args, "--engine", "ray", "--jobs", "2", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

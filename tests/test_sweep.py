@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import random
+import resource
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +21,7 @@ from sweep_samples import (
     SMALL_SETS,
     Deadly,
     DeadlyOnce,
+    foreign_modules,
     rows_in,
     small_plan,
     untimed,
@@ -35,6 +38,7 @@ from dnnmso_mj.sweep.journal import Journal, journal_path
 from dnnmso_mj.sweep.local import LocalEngine
 from dnnmso_mj.sweep.plan import Plan, plan_sweep
 from dnnmso_mj.sweep.run import run_sweep
+from dnnmso_mj.sweep.sources import sources_digest
 from dnnmso_mj.sweep.summary import summarise
 from dnnmso_mj.sweep.table import (
     METADATA_KEY,
@@ -43,6 +47,7 @@ from dnnmso_mj.sweep.table import (
     TIMING,
     finished_table,
     read_table,
+    write_table,
 )
 from dnnmso_mj.sweep.task import Task, failed_row, run_task
 
@@ -190,17 +195,13 @@ def test_parameters_of_mixed_kinds_are_json_text(plan):
         return finished_table(full, some, {})["p"]
 
     assert column([1, 2.5]).type == pa.float64()
-    assert column([[1, 2], [3]]).to_pylist() == [[1.0, 2.0], [3.0]]
+    assert column([[1, 2], [3]]).type == pa.list_(pa.int64())
+    assert column([[1, 2], [2.5]]).type == pa.list_(pa.float64())
+    assert column([[1, 2], [True]]).to_pylist() == ["[1, 2]", "[true]"]
     assert column([None, 2.0]).to_pylist() == [None, 2.0]
     assert column([1, "two"]).to_pylist() == ["1", '"two"']
     assert column([True, 1]).to_pylist() == ["true", "1"]
     assert column([{"kind": "constant"}]).to_pylist() == ['{"kind": "constant"}']
-
-
-def finished_rows_schema() -> pa.Schema:
-    from dnnmso_mj.sweep.table import ROW_SCHEMA
-
-    return ROW_SCHEMA
 
 
 def test_the_file_says_how_to_make_it_again(plan, tmp_path):
@@ -214,7 +215,7 @@ def test_the_file_says_how_to_make_it_again(plan, tmp_path):
     definition = provenance["definition"]
     assert definition["points"][1]["scenario"]["plant"]["gravity"] == 1.62
     assert definition["models"]["two_link"].startswith("<")
-    assert set(definition) == {"points", "models", "versions", "git_commit"}
+    assert set(definition) == {"points", "models", "versions", "git_commit", "source_sha256"}
     assert METADATA_KEY in pq.read_schema(out).metadata
 
 
@@ -279,6 +280,40 @@ def test_workers_that_cannot_start_are_an_error_not_an_endless_loop(plan, tmp_pa
     with pytest.raises(DnnmsoError, match="cannot start: exit status 7"):
         run_sweep(plan, tmp_path / "x.parquet", LocalEngine(2))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["numpy.py"]
+
+
+def test_too_many_workers_are_an_error_that_names_jobs(plan, tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 8, hard))
+    try:
+        with pytest.raises(DnnmsoError, match=r"--jobs: worker .* Too many open files; allowed"):
+            run_sweep(plan, tmp_path / "x.parquet", LocalEngine(50))
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_workers_run_the_code_that_planned_wherever_they_are_started(
+    plan, serial, tmp_path, monkeypatch
+):
+    foreign_modules(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    table = run_sweep(plan, tmp_path / "x.parquet", LocalEngine(2)).table
+    assert untimed(table).equals(untimed(serial))
+
+
+def test_a_table_without_every_run_is_not_written(plan, tmp_path):
+    class LosesOne(InProcess):
+        def rows(self, tasks):
+            rows = super().rows(tasks)
+            next(rows)
+            yield from rows
+
+    out = tmp_path / "x.parquet"
+    with pytest.raises(DnnmsoError, match="39 rows of 39 runs; allowed: 40"):
+        run_sweep(plan, out, LosesOne())
+    assert not out.exists()
+    assert run_sweep(plan, out, InProcess(), resume=True).kept == 39
 
 
 # Going on
@@ -350,6 +385,15 @@ def test_resume_refuses_other_software(plan, tmp_path):
         run_sweep(plan, out, resume=True)
 
 
+def test_resume_refuses_other_code_of_the_same_version(plan, tmp_path):
+    out = tmp_path / "x.parquet"
+    interrupt(plan, out)
+    now = sources_digest()
+    journal_path(out).write_text(journal_path(out).read_text().replace(now, now[::-1]))
+    with pytest.raises(DnnmsoError, match="source_sha256: "):
+        run_sweep(plan, out, resume=True)
+
+
 def test_resume_refuses_to_forget_seeds(plan, tmp_path):
     out = tmp_path / "x.parquet"
     run_sweep(plan, out, InProcess())
@@ -367,7 +411,60 @@ def test_a_damaged_journal_is_refused(plan, tmp_path):
         run_sweep(plan, out, resume=True)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({}, "point 0 has two rows of seed 2"),
+        ({"point": -1}, "a row of point -1; allowed: 0 to 3"),
+        ({"point": 4}, "a row of point 4; allowed: 0 to 3"),
+    ],
+)
+def test_a_journal_with_a_row_that_cannot_be_is_refused(plan, tmp_path, change, message):
+    out = tmp_path / "x.parquet"
+    interrupt(plan, out)
+    with journal_path(out).open("a") as stream:
+        stream.write(json.dumps(failed_row(0, 2, "for the test") | change) + "\n")
+    with pytest.raises(DnnmsoError) as refusal:
+        run_sweep(plan, out, resume=True)
+    assert f"damaged: {message}; --force starts anew" in str(refusal.value)
+    assert run_sweep(plan, out, InProcess(), force=True).kept == 0
+
+
 # Who may write
+
+
+def foreign(path: Path, kind: str) -> None:
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "parquet":
+        pq.write_table(pa.table({"seed": [1, 2]}), path)
+    else:
+        path.write_text("name: mine\n")
+
+
+@pytest.mark.parametrize("options", [{"force": True}, {"resume": True}, {}], ids=str)
+@pytest.mark.parametrize("kind", ["text", "parquet", "fifo"])
+@pytest.mark.parametrize("place", [Path, journal_path], ids=["table", "journal"])
+def test_no_file_but_a_sweeps_own_is_written_over(plan, tmp_path, place, kind, options):
+    out = tmp_path / "x.parquet"
+    foreign(place(out), kind)
+    before = os.stat(place(out))
+    with pytest.raises(DnnmsoError, match=r"exists and is not a .*; allowed: another --out"):
+        run_sweep(plan, out, Forbidden(), **options)
+    after = os.stat(place(out))
+    assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+    assert list(tmp_path.iterdir()) == [place(out)]
+
+
+def test_ctrl_c_while_the_table_is_written_leaves_no_part_of_it(tmp_path):
+    class Interrupted:
+        @property
+        def schema(self):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_table(Interrupted(), tmp_path / "x.parquet")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_finished_table_is_replaced_only_by_force(plan, serial, tmp_path):

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 from sweep_samples import DNNMSO, children, dnnmso, rows_in, untimed, wait_until
 
+from dnnmso_mj.paths import scenarios_dir
 from dnnmso_mj.sweep.local import LocalEngine
 from dnnmso_mj.sweep.plan import plan_sweep
 from dnnmso_mj.sweep.run import run_sweep
@@ -70,7 +71,9 @@ def test_json_is_one_object_with_every_point_and_every_failure(tmp_path):
     assert document["ticks_per_s"] == pytest.approx(document["ticks"] / document["wall_s"])
     stable, printed = document["points"]
     assert set(stable["metrics"]) == set(METRIC_TYPES) - {"diverged"}
-    assert set(stable["metrics"]["rmse"]) == {"n", "median", "q25", "q75", "ci_low", "ci_high"}
+    named = {"n", "median", "q25", "q75", "ci_low", "ci_high", "ci_method"}
+    assert set(stable["metrics"]["rmse"]) == named
+    assert stable["metrics"]["rmse"]["ci_method"] == "bootstrap"
     assert printed["metrics"]["rmse"]["n"] == 0
     assert [failure["seed"] for failure in document["failures"]] == list(range(6))
     assert document["failures"][0]["parameters"] == printed["parameters"]
@@ -116,6 +119,18 @@ def test_every_refusal_is_one_message_and_status_2_and_leaves_nothing(tmp_path, 
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
     assert list(tmp_path.iterdir()) == []
+
+
+def test_force_does_not_write_over_the_scenario_itself(tmp_path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text((scenarios_dir() / "paper.yaml").read_text())
+    before = mine.read_bytes()
+    args = ("--seeds", "0:2", "--out", "mine.yaml", "--force")
+    done = dnnmso("sweep", "mine.yaml", *SETS, *args, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "mine.yaml: exists and is not a table of `dnnmso sweep`" in done.stderr
+    assert mine.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [mine]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)

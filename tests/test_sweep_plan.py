@@ -95,6 +95,9 @@ def test_each_point_is_what_the_loader_makes_of_the_same_sets():
         ([], ["plant.masses=[1,2],[1,2"], "--grid plant.masses=[1,2"),
         ([], ["plant.gravity=1", "plant.gravity=2"], "given twice"),
         (["plant.gravity=1"], ["plant.gravity=2,3"], "also in --set"),
+        ([], ["plant.gravity=1.62,9.81", "plant={gravity: 3}"], "gravity: is a part of plant"),
+        (["plant={gravity: 3.0}"], ["plant.gravity=1,2"], "plant.gravity: is a part of plant"),
+        (["plant.masses.0=1"], ["plant.masses=[1,2]"], "plant.masses.0: is a part of plant.masses"),
         (["seed=4"], [], "--seeds"),
         ([], ["seed=1,2"], "--seeds"),
         ([], ["initial.q=[1],[1,2]"], "initial.q"),
@@ -122,6 +125,13 @@ def test_a_warning_is_said_once_for_each_place_not_once_for_each_point():
         warnings.simplefilter("always")
         plan_sweep("paper", [0], [SHORT, "imperfections.torque_limit=30"], grid)
     assert [item.category for item in caught] == [ScenarioWarning]
+
+
+def test_a_warning_of_a_grid_value_names_the_grid():
+    with pytest.warns(ScenarioWarning) as caught:
+        plan_sweep("paper", [0], [SHORT], ["imperfections.torque_limit=30,31"])
+    places = [str(item.message).partition(": ")[0] for item in caught]
+    assert places == [f"--grid imperfections.torque_limit={limit}" for limit in (30, 31)]
 
 
 def test_tasks_cover_every_run_once_and_leave_out_what_is_done():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dnnmso_mj.sweep.statistics import FEWEST_FOR_INTERVAL, spread
+from dnnmso_mj.sweep.statistics import FEWEST_FOR_INTERVAL, MOST_TO_RESAMPLE, spread
 
 
 def test_median_and_quartiles_of_a_known_sample():
@@ -23,6 +23,28 @@ def test_the_interval_is_near_the_exact_one_of_order_statistics():
     width = exact[1] - exact[0]
     assert found.ci_low == pytest.approx(exact[0], abs=0.15 * width)
     assert found.ci_high == pytest.approx(exact[1], abs=0.15 * width)
+
+
+def test_the_interval_of_many_values_is_the_narrowest_exact_one():
+    n = MOST_TO_RESAMPLE + 1
+    found = spread(np.random.default_rng(6).permutation(n).astype(float))  # value k has rank k + 1
+    assert found.ci_method == "order statistics"
+    low, high = int(found.ci_low) + 1, int(found.ci_high) + 1
+
+    def held(low: int, high: int) -> float:
+        return stats.binom.cdf(high - 1, n, 0.5) - stats.binom.cdf(low - 1, n, 0.5)
+
+    assert low + high == n + 1
+    assert held(low, high) >= 0.95 > held(low + 1, high - 1)
+
+
+def test_both_intervals_agree_where_one_takes_over_from_the_other():
+    values = np.random.default_rng(7).normal(size=MOST_TO_RESAMPLE + 1)
+    fewer, more = spread(values[:-1]), spread(values)
+    assert (fewer.ci_method, more.ci_method) == ("bootstrap", "order statistics")
+    width = more.ci_high - more.ci_low
+    assert fewer.ci_low == pytest.approx(more.ci_low, abs=0.15 * width)
+    assert fewer.ci_high == pytest.approx(more.ci_high, abs=0.15 * width)
 
 
 def test_the_interval_holds_the_true_median_about_as_often_as_it_says():
@@ -45,7 +67,7 @@ def test_same_values_give_the_same_interval_and_outliers_hardly_move_it():
 def test_too_few_values_have_no_interval_and_none_have_nothing():
     few = spread(np.arange(FEWEST_FOR_INTERVAL - 1, dtype=float))
     assert few.median == 2.0
-    assert few.ci_low is few.ci_high is None
+    assert few.ci_low is few.ci_high is few.ci_method is None
     enough = spread(np.arange(FEWEST_FOR_INTERVAL, dtype=float))
     assert enough.ci_low < enough.median < enough.ci_high
     nothing = spread(np.empty(0))

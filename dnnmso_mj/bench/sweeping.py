@@ -23,7 +23,7 @@ PLENTY_A_WORKER = 500  # for the pool, which takes in all its tasks at once
 
 def bench_sweep(quick: bool) -> list[Table]:
     """Closed-loop learning ticks a second, on one core and on all."""
-    ticks, seconds, rounds = (100, 0.2, 1) if quick else (1000, 3.0, 2)
+    ticks, seconds, rounds = (100, 0.2, 1) if quick else (1000, 3.0, 5)
     contenders = _contenders(ticks, seconds, (1, make_engine().jobs))
     rows = race(contenders, rounds, more_is_better=True, warm=False)
     return [

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 
 import mujoco
 import numpy as np
 
+from dnnmso_mj.errors import DnnmsoError
 from dnnmso_mj.network import initial_weights, network_shape
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf, build_spec, compile_spec
@@ -103,11 +106,24 @@ class TorchLoop:
 def pool_of_loops(scenario: Scenario, jobs: int, seeds: range) -> Generator[int]:
     """Run the loop for every seed in a pool of processes; yields each one's ticks when it is done.
 
-    Closing the iterator ends the processes.
+    Closing the iterator ends the processes, once the runs under way are done.
+
+    Raises:
+        DnnmsoError: a process could not start, or died.
     """
-    with get_context("spawn").Pool(jobs, initializer=_import_torch) as pool:
-        tasks = (scenario.model_copy(update={"seed": seed}) for seed in seeds)
-        yield from pool.imap_unordered(_one_loop, tasks)
+    # Not a multiprocessing.Pool, which starts children that cannot live over and over for ever.
+    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_import_torch)
+    try:
+        tasks = [scenario.model_copy(update={"seed": seed}) for seed in seeds]
+        for run in as_completed([pool.submit(_one_loop, task) for task in tasks]):
+            yield run.result()
+    except BrokenProcessPool as error:
+        raise DnnmsoError(
+            "a process of the pool of PyTorch loops cannot start or was killed; its own words "
+            "stand above; allowed: `dnnmso bench` where `import torch` works and memory is free"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _import_torch() -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dnnmso_mj.cli.shared import Json, Overrides, near, number, print_table
+from dnnmso_mj.cli.shared import Json, Overrides, near, number, print_table, working
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -58,7 +58,8 @@ def sweep(
     from dnnmso_mj.sweep.summary import summarise
 
     runner = make_engine(engine, jobs, address)
-    plan = plan_sweep(scenario, parse_seeds(seeds), overrides or (), grid or ())
+    with working("checking every point"):
+        plan = plan_sweep(scenario, parse_seeds(seeds), overrides or (), grid or ())
     out = out or default_out(plan)
     command = shlex.join(["dnnmso", *sys.argv[1:]])
     with _watching(plan) as watcher:
@@ -70,7 +71,8 @@ def sweep(
         except KeyboardInterrupt as stop:
             watcher.stop()
             raise KeyboardInterrupt(_how_to_go_on(watcher, plan, out)) from stop
-    points = summarise(result.table, plan)
+    with working("summing up"):
+        points = summarise(result.table, plan)
     if as_json:
         print(json.dumps(_document(result, points, plan, engine)))
     else:
@@ -210,6 +212,10 @@ def _print_summary(result: SweepResult, points: Sequence[PointSummary], plan: Pl
         _print_point(point, f"{name}, {here}" if here else name)
     if len(points) > POINTS_SHOWN:
         print(f"… and {len(points) - POINTS_SHOWN} more points; --json has them all")
+    spreads = [spread for point in points for spread in point.metrics.values()]
+    methods = {spread.ci_method for spread in spreads if spread.ci_method is not None}
+    if methods:
+        print(f"95 % of median: by {' and, where runs are many, by '.join(sorted(methods))}")
     _print_failures([failure for point in points for failure in point.failures], varied)
     counts = ", ".join(f"{count} {status}" for status, count in _counts(points).items())
     print(f"{len(result.table)} runs: {counts}")

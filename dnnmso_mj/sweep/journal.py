@@ -15,18 +15,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 import pyarrow as pa
 import pyarrow.json
 
 from dnnmso_mj.sweep.plan import Plan, SweepError, seeds_text
-from dnnmso_mj.sweep.table import ROW_SCHEMA, read_table, unfinished_rows
+from dnnmso_mj.sweep.table import ROW_SCHEMA, is_table, read_table, unfinished_rows
 from dnnmso_mj.sweep.task import Row
 from dnnmso_mj.wording import show
 
 SYNC_PERIOD = 1.0  # s; of what the machine's own end may cost
 LISTED = 8
+BEGINNING = b'{"points": ['  # of every journal: `Plan.definition` as JSON
 
 _PARSE = pyarrow.json.ParseOptions(explicit_schema=ROW_SCHEMA, unexpected_field_behavior="error")
 
@@ -59,8 +60,12 @@ class Journal:
         self._path = journal_path(out)
         self._synced = time.monotonic()
         self.done: list[set[int]] = [set() for _ in plan.points]
+        if out.exists() and not is_table(out):
+            _refuse_foreign(out, "a table of `dnnmso sweep`")
         if out.exists() and not (resume or force):
             raise SweepError(f"{out}: exists; {_ways_out('a finished sweep')}")
+        if self._path.exists() and not _is_journal(self._path):
+            _refuse_foreign(self._path, "a journal of `dnnmso sweep`")
         with _writing(self._path):
             out.parent.mkdir(parents=True, exist_ok=True)
             self._file = _lock(self._path)
@@ -114,7 +119,7 @@ class Journal:
                 table = pyarrow.json.read_json(stream, parse_options=_PARSE)
                 return table.select(ROW_SCHEMA.names).cast(ROW_SCHEMA)
         except (OSError, pa.ArrowException, ValueError) as error:
-            raise SweepError(f"{self._path}: damaged: {error}; --force starts anew") from error
+            self._damaged(error)
 
     def remove(self) -> None:
         """Delete the file; its rows are in the table now, or there are none."""
@@ -144,13 +149,17 @@ class Journal:
         try:
             before = json.loads(first)
         except ValueError as error:
-            raise SweepError(f"{self._path}: damaged: {error}; --force starts anew") from error
+            self._damaged(error)
         self._check_same(before)
         self._first_row = len(first)
         rows = self.rows()
         self._check_asked(rows)
         points, seeds = rows["point"].to_pylist(), rows["seed"].to_pylist()
         for point, seed in zip(points, seeds, strict=True):
+            if not 0 <= point < len(self.done):
+                self._damaged(f"a row of point {point}; allowed: 0 to {len(self.done) - 1}")
+            if seed in self.done[point]:
+                self._damaged(f"point {point} has two rows of seed {seed}")
             self.done[point].add(seed)
 
     def _finished_rows(self) -> pa.Table:
@@ -160,6 +169,9 @@ class Journal:
         rows = unfinished_rows(table, len(self._plan.points))
         self._check_asked(rows)
         return rows
+
+    def _damaged(self, what: object) -> NoReturn:
+        raise SweepError(f"{self._path}: damaged: {what}; --force starts anew")
 
     def _check_same(self, before: Any) -> None:
         now = json.loads(json.dumps(self._plan.definition()))
@@ -215,6 +227,21 @@ def _lock(path: Path) -> int:
             if os.path.samestat(path.stat(), os.fstat(file)):
                 return file
         os.close(file)  # the sweep that had it has ended and removed it
+
+
+def _is_journal(path: Path) -> bool:
+    """Whether this is a regular file that a sweep began, even if a kill tore its first line."""
+    if not path.is_file():
+        return False
+    with _writing(path), path.open("rb") as stream:
+        return BEGINNING.startswith(stream.read(len(BEGINNING)))
+
+
+def _refuse_foreign(path: Path, kind: str) -> NoReturn:
+    raise SweepError(
+        f"{path}: exists and is not {kind}, so nothing is written over it; "
+        "allowed: another --out, or remove it first"
+    )
 
 
 def _ways_out(what: str) -> str:

@@ -18,6 +18,7 @@ from dataclasses import replace
 from multiprocessing.connection import wait
 
 from dnnmso_mj.sweep.plan import SweepError
+from dnnmso_mj.sweep.sources import python_path
 from dnnmso_mj.sweep.task import Row, Task, failed_row
 
 # The cores are shared out by the sweep; a library's own threads would only fight for them.
@@ -96,7 +97,13 @@ class _Pool:
     def _start(self) -> None:
         task = self._next()
         if task is not None:
-            self._workers.append(_Worker(task))
+            try:
+                self._workers.append(_Worker(task))
+            except OSError as error:
+                raise SweepError(
+                    f"--jobs: worker process {len(self._workers) + 1} cannot be started: "
+                    f"{error.strerror or error}; allowed: fewer --jobs"
+                ) from error
 
     def _feed(self, worker: _Worker) -> None:
         task, worker.first = worker.first or self._next(), None
@@ -137,16 +144,17 @@ class _Worker:
         self.seeds: deque[int] = deque()
         self.ready = False
         self.pipe, theirs = multiprocessing.Pipe()
-        command = [sys.executable, "-m", "dnnmso_mj.sweep.worker", str(theirs.fileno())]
-        self._process = subprocess.Popen(  # noqa: S603  # no part of it comes from outside
-            command,
-            pass_fds=[theirs.fileno()],
-            stdin=subprocess.DEVNULL,
-            stdout=2,  # whatever a controller prints is not the sweep's output
-            env=os.environ | ONE_THREAD,
-            start_new_session=True,  # Ctrl-C is for the sweep to handle
-        )
-        theirs.close()
+        # Not from the current folder, whatever lies there: the code that planned.
+        command = [sys.executable, "-P", "-m", "dnnmso_mj.sweep.worker", str(theirs.fileno())]
+        with theirs:
+            self._process = subprocess.Popen(  # noqa: S603  # no part of it comes from outside
+                command,
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=2,  # whatever a controller prints is not the sweep's output
+                env=os.environ | ONE_THREAD | {"PYTHONPATH": python_path()},
+                start_new_session=True,  # Ctrl-C is for the sweep to handle
+            )
 
     def give(self, task: Task) -> None:
         self.task, self.seeds = task, deque(task.seeds)

@@ -7,7 +7,7 @@ import os
 import socket
 import time
 from collections.abc import Generator, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from dataclasses import replace
 from types import ModuleType
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 from dnnmso_mj.errors import MissingExtraError
 from dnnmso_mj.provenance import software_versions
 from dnnmso_mj.sweep.plan import NUMBERS_DEPEND_ON, SweepError
+from dnnmso_mj.sweep.sources import PACKAGE, sources_digest
 from dnnmso_mj.sweep.task import Row, Task, failed_row, run_task
 from dnnmso_mj.wording import clean
 
@@ -106,7 +107,7 @@ def _run_checked(task: Task, versions: dict[str, str]) -> list[Row]:
 
 def _versions() -> dict[str, str]:
     versions = software_versions()
-    return {name: versions[name] for name in NUMBERS_DEPEND_ON}
+    return {name: versions[name] for name in NUMBERS_DEPEND_ON} | {"code": sources_digest()[:12]}
 
 
 def _listing(versions: dict[str, str]) -> str:
@@ -142,7 +143,10 @@ def _connected(ray: ModuleType, address: str | None, jobs: int | None) -> Iterat
         options |= {"address": address}
     try:
         _check_reachable(address)
-        ray.init(**options)
+        # Ray puts the folder of this moment first where its workers import from: let it be the one
+        # that this code came from, not whatever the caller stands in.
+        with chdir(PACKAGE.parent):
+            ray.init(**options)
     except (OSError, ValueError, RuntimeError) as error:
         where = "this machine" if address is None else f"--address {clean(address)}"
         start = "allowed: auto or HOST:PORT of a cluster that `ray start --head` has started"

@@ -19,6 +19,7 @@ from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.provenance import git_commit, software_versions
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.simulate import simulate
+from dnnmso_mj.sweep.sources import sources_digest
 from dnnmso_mj.sweep.task import Task
 from dnnmso_mj.wording import clean
 
@@ -101,6 +102,7 @@ class Plan:
             "models": {p.scenario.plant.model: p.mjcf.text for p in self.points},
             "versions": {name: versions[name] for name in NUMBERS_DEPEND_ON},
             "git_commit": git_commit(),
+            "source_sha256": sources_digest(),
         }
 
 
@@ -126,8 +128,10 @@ def plan_sweep(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         points = [_point(source, sets, values, models) for values in itertools.product(*axes)]
-    for warning in {str(item.message): item.message for item in caught}.values():
-        warnings.warn(warning, stacklevel=2)
+    texts = [item.text for axis in axes for item in axis]
+    said = {_as_grid(str(item.message), texts): item.category for item in caught}
+    for message, category in said.items():
+        warnings.warn(message, category, stacklevel=2)
     return Plan(str(source), ordered, tuple(points))
 
 
@@ -219,9 +223,15 @@ def _split(text: str) -> list[str]:
 def _check_keys(sets: Sequence[Override], axes: Sequence[tuple[Override, ...]]) -> None:
     """Refuse a key that has two values, and a seed that `--seeds` would override."""
     grid = [axis[0].path for axis in axes]
-    for path in (*(item.path for item in sets), *grid):
-        if path == ("seed",):
-            raise SweepError("seed: has an option of its own; allowed: --seeds START:STOP")
+    paths = [*(item.path for item in sets), *grid]
+    if ("seed",) in paths:
+        raise SweepError("seed: has an option of its own; allowed: --seeds START:STOP")
+    for one, other in itertools.permutations(dict.fromkeys(paths), 2):
+        if other[: len(one)] == one:
+            below, above = clean(".".join(other)), clean(".".join(one))
+            raise SweepError(
+                f"{below}: is a part of {above}, which is set too; allowed: one of the two"
+            )
     for k, path in enumerate(grid):
         name = clean(".".join(path))
         if path in grid[:k]:
@@ -269,7 +279,10 @@ def _typed_as_grid(texts: Sequence[str]) -> Iterator[None]:
     try:
         yield
     except ScenarioError as error:
-        message = str(error)
-        for place in map(clean, texts):
-            message = message.replace(f"--set {place}:", f"--grid {place}:")
-        raise ScenarioError(message) from error
+        raise ScenarioError(_as_grid(str(error), texts)) from error
+
+
+def _as_grid(message: str, texts: Iterable[str]) -> str:
+    for place in map(clean, texts):
+        message = message.replace(f"--set {place}:", f"--grid {place}:")
+    return message

@@ -139,7 +139,13 @@ def run_sweep(
                     ticks += row["ticks"]
                     if watcher is not None:
                         watcher.row(row)
-        table = finished_table(journal.rows(), plan, _provenance(plan, engine, command))
+        rows_kept = journal.rows()
+        if not len(rows_kept) == journal.n_done == plan.n_runs:
+            raise SweepError(
+                f"{out}: {len(rows_kept)} rows of {journal.n_done} runs; allowed: {plan.n_runs}, "
+                "one a run; --resume makes what is missing"
+            )
+        table = finished_table(rows_kept, plan, _provenance(plan, engine, command))
         write_table(table, out)
         journal.remove()
     wall_s = time.perf_counter() - started

@@ -80,8 +80,10 @@ def write_table(table: pa.Table, out: Path) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         unfinished.replace(out)
-    except OSError as error:
+    except BaseException as error:
         unfinished.unlink(missing_ok=True)
+        if not isinstance(error, OSError):
+            raise
         raise SweepError(f"{out}: cannot be written: {error.strerror or error}") from error
 
 
@@ -96,6 +98,14 @@ def read_table(path: Path) -> tuple[pa.Table, dict[str, Any]]:
         return table, json.loads(table.schema.metadata[METADATA_KEY])
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
         raise SweepError(f"{path}: not a table of `dnnmso sweep`: {error}") from error
+
+
+def is_table(path: Path) -> bool:
+    """Whether this is a regular file that a sweep has written as its table."""
+    try:
+        return path.is_file() and METADATA_KEY in (pq.read_schema(path).metadata or {})
+    except (OSError, pa.ArrowException):
+        return False
 
 
 def unfinished_rows(table: pa.Table, n_points: int) -> pa.Table:
@@ -120,7 +130,9 @@ def _column(values: Sequence[Any]) -> pa.Array:
 def _nested(values: Sequence[Any], kinds: set[type]) -> pa.Array:
     if kinds == {list}:
         try:
-            return pa.array(values, pa.list_(pa.float64()))
-        except (pa.ArrowException, TypeError):
+            array = pa.array(values)  # whole numbers stay whole
+            if array.type in {pa.list_(pa.int64()), pa.list_(pa.float64())}:
+                return array
+        except (pa.ArrowException, TypeError, OverflowError):
             pass
     return pa.array([json.dumps(value, ensure_ascii=False) for value in values])
