@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 from numba.core import event
 
+from dnnmso_mj.compile_loop import compile_elsewhere
 from dnnmso_mj.compiling import CompileNotice
 from dnnmso_mj.controllers import Controller, build_controller, compiled_ticks
 from dnnmso_mj.errors import NonFiniteError
@@ -97,6 +98,7 @@ class Simulation:
         self.scenario = scenario
         self.plant = Plant(scenario, mjcf)
         self.reference = Reference(scenario.reference, n)
+        self._mjcf = None if controller else mjcf  # what the controller can be made of again
         self.controller = controller or build_controller(scenario, mjcf, watch=watch)
         self.layout = StepLayout(n, self.controller.n_layers)
         self._columns = {name: self.layout.slices[name].start for name in CHANGES}
@@ -174,7 +176,10 @@ class Simulation:
             self.controller.restore(self._first_state)
         with event.install_listener("numba:compile", CompileNotice()):
             if self._ticks is not None:
-                self._ticks.run(self.world, self._ticks.parts, 0, 0)
+                arguments = (self.world, self._ticks.parts, 0, 0)
+                if self._mjcf is not None:
+                    compile_elsewhere(self._ticks.run, arguments, self.scenario, self._mjcf)
+                self._ticks.run(*arguments)
             elif self.world.pace.period_ns:
                 state, world = self.controller.state(), self.world
                 self._start()

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import simulate
 
 ROOT = Path(__file__).parents[1]
 
@@ -29,8 +29,7 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def compiled_loop() -> None:
     """Compile once, so that no test of a command line sees the notice that it does."""
-    for name in ("paper", "paper_no_network", "classical_mso"):
-        simulate(load_scenario(name, ["duration=0.01"]))
+    subprocess.run([sys.executable, ROOT / "tests" / "warm_up.py"], check=True)
 
 
 @pytest.fixture(scope="session")

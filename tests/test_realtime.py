@@ -52,9 +52,8 @@ def test_deadlines_are_absolute_so_that_nothing_drifts(make_scenario, two_link):
     """Half a second of hanging is caught up with, not added."""
     stalls = {"stalls": [{"at": 0.5, "duration": 0.3}, {"at": 0.6, "duration": 0.2}]}
     scenario = make_scenario({"kind": "no_network"}, duration=2.0, real_time=stalls)
-    began = time.monotonic()
     trace = run_paced(scenario, two_link)
-    assert time.monotonic() - began < 2.4
+    assert trace.info.wall_s < 2.25
     assert np.count_nonzero(trace["deadline_missed"]) >= 500  # the second waits for the first
 
 

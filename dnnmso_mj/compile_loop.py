@@ -1,0 +1,63 @@
+"""Compile a controller's loop in a process of its own, for all others to load from disk.
+
+A process that compiles runs the code it has just made of each function, others run what was put on
+disk for the whole loop, and the two may round differently. So that every run of a seed is the same
+to the last bit, the first one too, no run compiles its own loop.
+
+`python -m dnnmso_mj.compile_loop` takes a scenario and its model as JSON on standard input.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from numba.core import event
+
+from dnnmso_mj.compiling import CompileNotice
+from dnnmso_mj.plant import Mjcf
+from dnnmso_mj.scenario import Scenario
+
+
+def compile_elsewhere(run: Any, arguments: tuple[Any, ...], scenario: Scenario, mjcf: Mjcf) -> None:
+    """Have `run` compiled for these arguments by another process, unless that has been done.
+
+    Where no process can be started, this one compiles when `run` is called.
+
+    Args:
+        run: a controller's `run_ticks`.
+        arguments: what it will be called with.
+        scenario, mjcf: what another process makes such arguments of.
+    """
+    types = tuple(run.typeof_pyval(argument) for argument in arguments)
+    if types in run.overloads or run._cache.load_overload(types, run.targetctx) is not None:
+        return
+    folder = str(Path(__file__).parents[1])
+    paths = [folder, *filter(None, [os.environ.get("PYTHONPATH")])]
+    subprocess.run(  # no part of it comes from outside
+        [sys.executable, "-P", "-m", "dnnmso_mj.compile_loop"],
+        input=json.dumps([scenario.model_dump_json(), mjcf.text, mjcf.folder]).encode(),
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+        check=False,
+    )
+
+
+def main() -> None:
+    """Compile the loop that standard input describes."""
+    from dnnmso_mj.controllers import compiled_ticks
+    from dnnmso_mj.simulate import Simulation
+
+    scenario, text, folder = json.loads(sys.stdin.buffer.read())
+    simulation = Simulation(Scenario.model_validate_json(scenario), Mjcf(text, folder))
+    ticks = compiled_ticks(simulation.controller)
+    if ticks is not None:
+        with event.install_listener("numba:compile", CompileNotice()):
+            ticks.run(simulation.world, ticks.parts, 0, 0)
+
+
+if __name__ == "__main__":
+    main()
