@@ -71,8 +71,8 @@ def run_logged(
         except KeyboardInterrupt as stop:
             wall = time.perf_counter() - started
             info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
-            _finish(simulation, recorder, info)
-            raise RunInterrupted(recorder.path, recorder.ticks) from stop
+            trace = _finish(simulation, recorder, info)
+            raise RunInterrupted(recorder.path, len(trace)) from stop
         return LoggedRun(_finish(simulation, recorder, info), recorder.path)
 
 
