@@ -13,7 +13,7 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
+from contextlib import suppress
 from typing import Any
 
 from numba.core import event
@@ -21,6 +21,7 @@ from numba.core import event
 from dnnmso_mj.compiling import CompileNotice
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.sources import python_path
 
 
 def compile_elsewhere(run: Any, arguments: tuple[Any, ...], scenario: Scenario, mjcf: Mjcf) -> None:
@@ -33,17 +34,24 @@ def compile_elsewhere(run: Any, arguments: tuple[Any, ...], scenario: Scenario, 
         arguments: what it will be called with.
         scenario, mjcf: what another process makes such arguments of.
     """
-    types = tuple(run.typeof_pyval(argument) for argument in arguments)
-    if types in run.overloads or run._cache.load_overload(types, run.targetctx) is not None:
+    if is_compiled(run, arguments):
         return
-    folder = str(Path(__file__).parents[1])
-    paths = [folder, *filter(None, [os.environ.get("PYTHONPATH")])]
-    subprocess.run(  # no part of it comes from outside
-        [sys.executable, "-P", "-m", "dnnmso_mj.compile_loop"],
-        input=json.dumps([scenario.model_dump_json(), mjcf.text, mjcf.folder]).encode(),
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
-        check=False,
-    )
+    with suppress(OSError):
+        subprocess.run(
+            [sys.executable, "-P", "-m", "dnnmso_mj.compile_loop"],
+            input=json.dumps([scenario.model_dump_json(), mjcf.text, mjcf.folder]).encode(),
+            env=os.environ | {"PYTHONPATH": python_path()},
+            start_new_session=True,  # Ctrl-C is for us, and we end it
+            check=False,
+        )
+
+
+def is_compiled(run: Any, arguments: tuple[Any, ...]) -> bool:
+    """Whether `run` is compiled for these arguments, here or on disk; nothing is loaded."""
+    types = tuple(run.typeof_pyval(argument) for argument in arguments)
+    on_disk = run._cache
+    key = on_disk._index_key(types, run.targetctx.codegen())
+    return types in run.overloads or key in on_disk._cache_file._load_index()
 
 
 def main() -> None:

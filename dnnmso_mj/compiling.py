@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
@@ -13,22 +11,14 @@ from numba import config, njit
 from numba.core import event
 
 from dnnmso_mj.errors import DnnmsoError
+from dnnmso_mj.sources import sources_digest
 
 Array = np.ndarray
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def _sources() -> str:
-    """A digest of every source that is compiled, since each is compiled into its callers."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        text = path.read_bytes()
-        if b"@compiled" in text or b"@inner" in text or b"ExternalFunction" in text:
-            digest.update(text)
-    return digest.hexdigest()
-
-
-_SOURCES = _sources()
+# Of every source that is compiled, since each is compiled into its callers.
+_SOURCES = sources_digest(b"@compiled", b"@inner", b"ExternalFunction")
 
 
 def compiled(function: F) -> F:

@@ -77,7 +77,7 @@ def build_net(shape: Shape, weights: Array, spec: MadamSpec) -> Net:
         activation=ACTIVATIONS[shape.activation],
         bias_correction=spec.bias_correction,
     )
-    net.w[:] = pack(net, shape, weights)
+    net.w[:] = pack(shape, weights)
     return net
 
 
@@ -100,15 +100,15 @@ def _padded(size: int) -> int:
     return -(-size // LANES) * LANES
 
 
-def pack(net: Net, shape: Shape, flat: Array) -> Array:
+def pack(shape: Shape, flat: Array) -> Array:
     """Flat (n_weights,) values, matrix after matrix as in `Shape`, in the kernel's order."""
-    packed = np.zeros_like(net.w)
+    packed = np.zeros(_layers(shape)[-1].end, flat.dtype)
     for W, matrix in zip(_matrices(shape, packed), shape.split(flat), strict=True):
         W[:] = matrix
     return packed
 
 
-def unpack(net: Net, shape: Shape, packed: Array) -> Array:
+def unpack(shape: Shape, packed: Array) -> Array:
     """The inverse of `pack`, as a new array."""
     return np.concatenate([W.ravel() for W in _matrices(shape, packed)])
 

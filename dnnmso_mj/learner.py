@@ -93,15 +93,15 @@ class KernelLearner:
 
     def state(self) -> dict[str, Array]:
         return {
-            "weights": kernel.unpack(self.net, self.shape, self.net.w),
-            "second_moment": kernel.unpack(self.net, self.shape, self.net.v),
+            "weights": kernel.unpack(self.shape, self.net.w),
+            "second_moment": kernel.unpack(self.shape, self.net.v),
             "updates": self.net.updates.copy(),
             **held(self.monitors),
         }
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        self.net.w[:] = kernel.pack(self.net, self.shape, state["weights"])
-        self.net.v[:] = kernel.pack(self.net, self.shape, state["second_moment"])
+        self.net.w[:] = kernel.pack(self.shape, state["weights"])
+        self.net.v[:] = kernel.pack(self.shape, state["second_moment"])
         self.net.updates[:] = state["updates"]
         hold(self.monitors, state)
 

@@ -1,7 +1,7 @@
 """What learning does to the network: watched for ten updates, then one in ten.
 
-Watching needs the gradient as a vector and a second backward pass, several times the work of the
-update itself, and changes nothing: the trajectory is the same with and without. Between two looks
+Watching needs the gradient as a vector and a second backward pass, more work than the update
+itself, and changes nothing: the trajectory is the same with and without. Between two looks
 the last values are held. Every update that may be clamped is looked at: |g/ḡ|, at most 1/√(1 − β),
 would have to exceed η*/η, or a weight to be near σ*.
 """

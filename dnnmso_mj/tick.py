@@ -4,19 +4,21 @@
     update          the controller commands and learns
     end_tick        actuators, true dynamics, the row for the log, one step of MuJoCo
 
-Tick k is at t_k = k·dt: time is computed, never accumulated. Every loop has these three calls; a
-controller's compiled loop has them in its own file (`run_ticks`), others are called by `simulate`.
+Tick k is at t_k = k·dt: time is computed, never accumulated. `closed_loop` puts a controller's
+compiled update between the two halves; `simulate` calls them around one that is not compiled.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from types import FunctionType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from dnnmso_mj.clock import now_ns, sleep_until
-from dnnmso_mj.compiling import copy, inner
+from dnnmso_mj.compiling import compiled, copy, inner
 from dnnmso_mj.imperfections import Actuators, actuate
 from dnnmso_mj.inversion import solve_spd
 from dnnmso_mj.plant import Nominal, PlantView, forward, inertia, integrate, solve_inertia
@@ -26,17 +28,19 @@ if TYPE_CHECKING:
     from dnnmso_mj.controllers import Command
 
 Array = np.ndarray
+Update = Callable[[Any, Array, Array, Array], None]
+Loop = Callable[["World", Any, int, int], int]
 
 # rad, rad/s: no arm is there and comes back.
 DIVERGED_ABOVE = 1e3
 MUJOCO_ZEROES_ABOVE = 1e9  # N·m; from 1e10 on MuJoCo drops a torque with a mere warning
 
-# Why a loop ended: slots of `World.status`.
+# Why a loop ended: values of the slot STATUS.
 RUNNING, TAU_NOT_FINITE, TAU_TOO_LARGE, ROW_NOT_FINITE, OUT_OF_RANGE = range(5)
 
 # Slots of `World.counts`.
-STATUS, ROWS, CHUNK_START, START_NS, CONTROLLED, MISSED, STALLS, STARTED_NS, TOOK_NS = range(9)
-N_COUNTS = 9
+STATUS, ROWS, CHUNK_START, START_NS, CONTROLLED, MISSED, STALLS, TOOK_NS = range(8)
+N_COUNTS = 8
 
 # What acts on a joint whose command came too late.
 HOLD, ZERO, DAMPED = range(3)
@@ -79,21 +83,43 @@ class World(NamedTuple):
     dt: float
 
 
-@inner
-def timed_from(world: World) -> None:
-    """The controller's update begins."""
-    world.counts[STARTED_NS] = now_ns(world.timespec)
+def closed_loop(update: Update) -> Loop:
+    """Compile the whole loop around a controller's `update(parts, x, x_ref, xd_ref)`.
+
+    `update` is an `inner` function, and its parts have a field `command`. The loop takes (world,
+    parts, first, count), runs ticks first to first + count, and returns how many were done.
+
+    N.B. each loop is `_run_ticks` with an `update` of its own for that global name, and a name of
+    its own on disk: compiled code with a function in a closure could not be kept there.
+    """
+    names = globals() | {"update": update}
+    loop = FunctionType(_run_ticks.__code__, names, "run_ticks")
+    loop.__qualname__ = f"run_ticks.{update.__module__}"
+    return compiled(loop)
 
 
-@inner
-def timed_to(world: World) -> None:
-    """The controller's update ends."""
-    world.counts[TOOK_NS] = now_ns(world.timespec) - world.counts[STARTED_NS]
+def _run_ticks(world: World, parts: Any, first: int, count: int) -> int:
+    for k in range(first, first + count):
+        if begin_tick(world, k):
+            began = now_ns(world.timespec)
+            update(parts, world.x, world.x_ref, world.xd_ref)
+            world.counts[TOOK_NS] = now_ns(world.timespec) - began
+        if end_tick(world, parts.command, k):
+            return k + 1 - first
+    return count
+
+
+def update(parts: Any, x: Array, x_ref: Array, xd_ref: Array) -> None:
+    """What `closed_loop` puts a controller's law in the place of."""
 
 
 @inner
 def begin_tick(world: World, k: int) -> bool:
     """Wait for tick k, read sensors and reference; False where real time has passed all of it."""
+    world.counts[TOOK_NS] = 0
+    world.late_ns[0] = 0
+    in_time = world.pace.period_ns == 0 or _wait(world, k)
+    world.counts[CONTROLLED] = 1 if in_time else 0
     n, plant = world.tau.size, world.plant
     i = k - world.counts[CHUNK_START]
     for j in range(n):
@@ -102,10 +128,6 @@ def begin_tick(world: World, k: int) -> bool:
         world.xd_ref[j], world.xd_ref[n + j] = world.qd_ref[i, j], world.qdd_ref[i, j]
     for j in range(2 * n):
         world.e_track[j] = world.x[j] - world.x_ref[j]
-    world.counts[TOOK_NS] = 0
-    world.late_ns[0] = 0
-    in_time = world.pace.period_ns == 0 or _wait(world, k)
-    world.counts[CONTROLLED] = 1 if in_time else 0
     return in_time
 
 

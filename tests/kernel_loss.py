@@ -19,4 +19,4 @@ def loss_and_gradient(
     net.deltas[last : last + delta.size] = delta
     g = np.zeros_like(net.w)
     kernel.gradient(net, g)
-    return loss, kernel.unpack(net, shape, g)
+    return loss, kernel.unpack(shape, g)

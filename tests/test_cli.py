@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -249,6 +250,30 @@ def test_help_and_version_answer(tmp_path):
     assert dnnmso("--version", cwd=tmp_path).stdout.count(".") == 2
 
 
+def test_ctrl_c_while_the_loop_is_compiled_is_one_line_and_leaves_no_process(tmp_path):
+    cold = {"NUMBA_CACHE_DIR": str(tmp_path / "cold")}
+    process = started("run", "paper", "--no-plot", cwd=tmp_path, stderr=subprocess.PIPE, env=cold)
+    try:
+        assert process.stderr.readline().startswith("compiling")
+        assert len(processes_with(f"NUMBA_CACHE_DIR={cold['NUMBA_CACHE_DIR']}")) == 2
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert stderr == "interrupted; log: logs/paper.mcap (0 s of 10 s)\n"
+    assert not processes_with(f"NUMBA_CACHE_DIR={cold['NUMBA_CACHE_DIR']}")
+
+
+def processes_with(setting: str) -> list[str]:
+    found = []
+    for environ in Path("/proc").glob("[0-9]*/environ"):
+        with suppress(OSError):
+            if setting.encode() in environ.read_bytes().split(b"\0"):
+                found.append(environ.parent.name)
+    return found
+
+
 def test_ctrl_c_ends_a_run_with_its_log_whole_and_says_where_it_is(tmp_path):
     args = ("run", "paper", "--set", "duration=600", "--out", "long.mcap")
     process = started(*args, cwd=tmp_path, stderr=subprocess.PIPE)
@@ -280,12 +305,16 @@ def test_ctrl_c_outside_a_run_is_told_too(tmp_path):
         process.kill()
 
 
-def started(*args: object, cwd: Path, stderr: int) -> subprocess.Popen[str]:
+def started(
+    *args: object, cwd: Path, stderr: int, env: dict[str, str] | None = None
+) -> subprocess.Popen[str]:
     """A command that listens to Ctrl-C, as one that a background shell starts does not."""
     listening = "import os, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
     command = [sys.executable, "-c", f"{listening}; os.execv(sys.argv[1], sys.argv[1:])"]
     command += [str(DNNMSO), *map(str, args)]
-    return subprocess.Popen(command, cwd=cwd, stderr=stderr, text=True)
+    return subprocess.Popen(
+        command, cwd=cwd, stderr=stderr, text=True, env=os.environ | (env or {})
+    )
 
 
 def read_until(terminal: int, word: bytes) -> None:

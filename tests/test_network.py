@@ -158,8 +158,8 @@ def test_kernel_order_is_padded_with_zeros_that_stay_zero(shape, seed):
     w = rng.normal(size=shape.n_weights)
     learner = KernelLearner(shape, w, MadamSpec())
     net = learner.net
-    assert np.array_equal(kernel.unpack(net, shape, net.w), w)
-    padding = kernel.pack(net, shape, np.ones_like(w)) == 0
+    assert np.array_equal(kernel.unpack(shape, net.w), w)
+    padding = kernel.pack(shape, np.ones_like(w)) == 0
     learner.predict(rng.normal(size=shape.sizes[0]))
     learner.learn(rng.normal(size=shape.sizes[-1]))
     assert not np.any(net.w[padding])

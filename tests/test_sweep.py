@@ -34,11 +34,11 @@ from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.run import run_logged
 from dnnmso_mj.simulate import simulate
+from dnnmso_mj.sources import sources_digest
 from dnnmso_mj.sweep.journal import Journal, journal_path
 from dnnmso_mj.sweep.local import LocalEngine
 from dnnmso_mj.sweep.plan import Plan, plan_sweep
 from dnnmso_mj.sweep.run import run_sweep
-from dnnmso_mj.sweep.sources import sources_digest
 from dnnmso_mj.sweep.summary import summarise
 from dnnmso_mj.sweep.table import (
     METADATA_KEY,

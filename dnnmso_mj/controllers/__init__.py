@@ -13,7 +13,7 @@ from dnnmso_mj.plant import Mjcf, NominalModel
 from dnnmso_mj.scenario import ClassicalMso, DnnMso, NoNetwork, Scenario
 
 if TYPE_CHECKING:
-    from dnnmso_mj.tick import World
+    from dnnmso_mj.tick import Loop
 
 Array = np.ndarray
 
@@ -48,8 +48,8 @@ def command_of(inversion: DynamicInversion, e_obs: Array, monitors: Monitors) ->
 class CompiledTicks(NamedTuple):
     """A controller's whole ticks as compiled code."""
 
-    run: Callable[[World, Any, int, int], int]
-    """(world, parts, first, count) -> ticks done; see `tick`."""
+    run: Loop
+    """(world, parts, first, count) -> ticks done; see `tick.closed_loop`."""
     parts: Any
     """The controller's arrays, a NamedTuple."""
     update: Callable[..., Command]

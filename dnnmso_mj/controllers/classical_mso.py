@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dnnmso_mj import monitors
-from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.compiling import copy, inner
 from dnnmso_mj.controllers import Command, CompiledTicks, command_of
 from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert, solve_spd
 from dnnmso_mj.kernel import Net, forward, output_at
@@ -28,18 +28,17 @@ from dnnmso_mj.monitors import Watch
 from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
 from dnnmso_mj.plant import Nominal, NominalModel, bias, inertia
 from dnnmso_mj.scenario import ClassicalMso
-from dnnmso_mj.tick import World, begin_tick, end_tick, timed_from, timed_to
+from dnnmso_mj.tick import closed_loop
 
 Array = np.ndarray
 
 
-class Parts(NamedTuple):
-    """The controller's arrays."""
+class Law(NamedTuple):
+    """The controller's arrays but for its command and its network."""
 
     nominal: Nominal
     inversion: DynamicInversion
     observer: StateObserver
-    command: Command
     f_obs: Array  # (2n,) what the observer integrates
     learned: Array  # (n,) B₂ d̂
     delta: Array  # (n,) ∂loss/∂d̂
@@ -47,10 +46,11 @@ class Parts(NamedTuple):
     L: Array  # (n, n) scratch
 
 
-class LearningParts(NamedTuple):
-    """The same with the compiled network."""
+class Parts(NamedTuple):
+    """The arrays of the compiled controller."""
 
-    law: Parts
+    law: Law
+    command: Command
     net: Net
     watch: Watch
 
@@ -83,11 +83,11 @@ class ClassicalMsoController:
         self._nominal = nominal  # keeps alive what compiled code knows by address
         inversion = build_inversion(spec.inversion, n, nominal.view)
         observer = build_observer(spec.observer, 2 * n, dt)
-        self._parts = Parts(
+        self._command = command_of(inversion, observer.e_obs, self.learner.monitors)
+        self._law = Law(
             nominal=nominal.view,
             inversion=inversion,
             observer=observer,
-            command=command_of(inversion, observer.e_obs, self.learner.monitors),
             f_obs=np.zeros(2 * n),
             learned=np.zeros(n),
             delta=np.zeros(n),
@@ -96,80 +96,73 @@ class ClassicalMsoController:
         )
         self.ticks = None
         if isinstance(self.learner, KernelLearner):
-            parts = LearningParts(self._parts, self.learner.net, self.learner.watch)
+            parts = Parts(self._law, self._command, self.learner.net, self.learner.watch)
             self.ticks = CompiledTicks(run_ticks, parts, ClassicalMsoController.update)
 
     def reset(self, x: Array) -> None:
-        start(self._parts.observer, x)
+        start(self._law.observer, x)
 
     def update(self, x: Array, x_ref: Array, xd_ref: Array) -> Command:
         if self.ticks is not None:
             update(self.ticks.parts, x, x_ref, xd_ref)
         else:
-            command_with(self._parts, self.learner.predict(x), x, x_ref, xd_ref)
-            self.learner.learn(self._parts.delta)
-        return self._parts.command
+            d_hat = self.learner.predict(x)
+            command_with(self._law, self._command, d_hat, x, x_ref, xd_ref)
+            self.learner.learn(self._law.delta)
+        return self._command
 
     def state(self) -> dict[str, Array]:
-        return {"x_hat": self._parts.observer.x_hat.copy(), **self.learner.state()}
+        return {"x_hat": self._law.observer.x_hat.copy(), **self.learner.state()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        start(self._parts.observer, state["x_hat"])
+        start(self._law.observer, state["x_hat"])
         self.learner.restore(state)
 
 
 @inner
-def command_with(parts: Parts, d_hat: Array, x: Array, x_ref: Array, xd_ref: Array) -> None:
+def command_with(
+    law: Law, command: Command, d_hat: Array, x: Array, x_ref: Array, xd_ref: Array
+) -> None:
     """Everything of a tick but the network: command with d̂ (n,), leave ∂loss/∂d̂ in `delta`."""
-    n, observer, command = d_hat.size, parts.observer, parts.command
+    n, observer = d_hat.size, law.observer
     compare(observer, x)
     copy(observer.x_hat, command.x_hat)
-    _known(parts, x, command.f_hat)
+    _known(law, x, command.f_hat)
     for i in range(n):
-        parts.free[i] = d_hat[i]
-    solve_spd(parts.nominal.M, parts.free, parts.learned, parts.L)
+        law.free[i] = d_hat[i]
+    solve_spd(law.nominal.M, law.free, law.learned, law.L)
     for i in range(n):
-        command.f_hat[n + i] += parts.learned[i]
-    invert(parts.inversion, x, x_ref, xd_ref, command.f_hat)
-    solve_spd(parts.nominal.M, observer.e_obs[n:], parts.delta, parts.L)  # B₂ is symmetric
+        command.f_hat[n + i] += law.learned[i]
+    invert(law.inversion, x, x_ref, xd_ref, command.f_hat)
+    solve_spd(law.nominal.M, observer.e_obs[n:], law.delta, law.L)  # B₂ is symmetric
     for i in range(n):
-        parts.delta[i] = -parts.delta[i]
-    _known(parts, observer.x_hat, parts.f_obs)
+        law.delta[i] = -law.delta[i]
+    _known(law, observer.x_hat, law.f_obs)
     for i in range(n):
-        parts.f_obs[n + i] += parts.learned[i]
-    advance(observer, parts.f_obs, parts.inversion.Bu)
+        law.f_obs[n + i] += law.learned[i]
+    advance(observer, law.f_obs, law.inversion.Bu)
 
 
 @inner
-def _known(parts: Parts, x: Array, out: Array) -> None:
+def _known(law: Law, x: Array, out: Array) -> None:
     """f(x) = [q̇; −M⁻¹(V + G)] (2n,) of the nominal model, whose M(q) stays behind."""
-    n = parts.free.size
-    inertia(parts.nominal, x[:n])
-    bias(parts.nominal, x[:n], x[n:])
-    solve_spd(parts.nominal.M, parts.nominal.bias, parts.free, parts.L)
+    n = law.free.size
+    inertia(law.nominal, x[:n])
+    bias(law.nominal, x[:n], x[n:])
+    solve_spd(law.nominal.M, law.nominal.bias, law.free, law.L)
     for i in range(n):
-        out[i], out[n + i] = x[n + i], -parts.free[i]
+        out[i], out[n + i] = x[n + i], -law.free[i]
 
 
 @inner
-def update(parts: LearningParts, x: Array, x_ref: Array, xd_ref: Array) -> None:
+def update(parts: Parts, x: Array, x_ref: Array, xd_ref: Array) -> None:
     """One tick of the law above."""
     law, net = parts.law, parts.net
-    command_with(law, forward(net, x), x, x_ref, xd_ref)
+    command_with(law, parts.command, forward(net, x), x, x_ref, xd_ref)
     delta = output_at(net)
     for i in range(law.delta.size):
         net.deltas[delta + i] = law.delta[i]
-    monitors.learn(net, parts.watch, law.command.monitors)
+    monitors.learn(net, parts.watch, parts.command.monitors)
 
 
-@compiled
-def run_ticks(world: World, parts: LearningParts, first: int, count: int) -> int:
-    """Ticks first to first + count of the closed loop; returns how many were done."""
-    for k in range(first, first + count):
-        if begin_tick(world, k):
-            timed_from(world)
-            update(parts, world.x, world.x_ref, world.xd_ref)
-            timed_to(world)
-        if end_tick(world, parts.law.command, k):
-            return k + 1 - first
-    return count
+run_ticks = closed_loop(update)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dnnmso_mj import monitors
-from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.compiling import copy, inner
 from dnnmso_mj.controllers import Command, CompiledTicks, command_of
 from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert
 from dnnmso_mj.kernel import Net, forward, output_at
@@ -24,7 +24,7 @@ from dnnmso_mj.monitors import Watch
 from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.scenario import DnnMso
-from dnnmso_mj.tick import World, begin_tick, end_tick, timed_from, timed_to
+from dnnmso_mj.tick import closed_loop
 
 Array = np.ndarray
 
@@ -131,14 +131,4 @@ def update(parts: Parts, x: Array, x_ref: Array, xd_ref: Array) -> None:
     advance(observer, command.f_hat, parts.inversion.Bu)
 
 
-@compiled
-def run_ticks(world: World, parts: Parts, first: int, count: int) -> int:
-    """Ticks first to first + count of the closed loop; returns how many were done."""
-    for k in range(first, first + count):
-        if begin_tick(world, k):
-            timed_from(world)
-            update(parts, world.x, world.x_ref, world.xd_ref)
-            timed_to(world)
-        if end_tick(world, parts.command, k):
-            return k + 1 - first
-    return count
+run_ticks = closed_loop(update)

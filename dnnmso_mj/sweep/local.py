@@ -17,8 +17,8 @@ from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import wait
 
+from dnnmso_mj.sources import python_path
 from dnnmso_mj.sweep.plan import SweepError
-from dnnmso_mj.sweep.sources import python_path
 from dnnmso_mj.sweep.task import Row, Task, failed_row
 
 # The cores are shared out by the sweep; a library's own threads would only fight for them.

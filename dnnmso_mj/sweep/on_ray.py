@@ -14,8 +14,8 @@ from typing import Any
 
 from dnnmso_mj.errors import MissingExtraError
 from dnnmso_mj.provenance import software_versions
+from dnnmso_mj.sources import PACKAGE, sources_digest
 from dnnmso_mj.sweep.plan import NUMBERS_DEPEND_ON, SweepError
-from dnnmso_mj.sweep.sources import PACKAGE, sources_digest
 from dnnmso_mj.sweep.task import Row, Task, failed_row, run_task
 from dnnmso_mj.wording import clean
 

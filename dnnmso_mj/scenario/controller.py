@@ -1,0 +1,213 @@
+"""The typed controller of a scenario: its kind, gains, network and learning rule."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field, model_validator
+
+from dnnmso_mj.scenario.fields import (
+    Matrix,
+    NonNegative,
+    Positive,
+    PositiveEach,
+    Positives,
+    Strict,
+    WeightScale,
+    as_tuple,
+    refusal,
+)
+
+MAX_WEIGHTS = 10_000_000
+
+
+class Network(Strict):
+    """The deep network f̂ and its initial weights."""
+
+    hidden: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=4096)], ...],
+        Field(min_length=1, max_length=32),
+        BeforeValidator(as_tuple),
+    ] = (64, 64, 64)
+    """Width of each hidden layer; three hidden layers make the paper's four weight layers."""
+    activation: Literal["sigmoid", "tanh", "relu"] = "sigmoid"
+    """Activation of the hidden layers; the output layer is linear."""
+    outputs: Literal["full", "kinematic"] = "full"
+    """full: all 2n rows are learned (paper). kinematic: the upper n rows are the measured q̇."""
+    bias: bool = True
+    """Whether each layer sees a constant 1 beside its inputs."""
+    init_scale: WeightScale | None = None
+    """Kumar's constant: spread = init_scale/√fan_in. null: the activation's own (sigmoid 3.6)."""
+    init_spread: Literal["standard_deviation", "variance"] = "standard_deviation"
+    """Whether init_scale/√fan_in is a standard deviation or a variance; the paper does not say."""
+    output_scale: WeightScale = 1.0
+    """Factor on the initial weights of the output layer."""
+    backend: Literal["kernel", "torch"] = "kernel"
+    """kernel: compiled (fast). torch: the reference that the kernel is tested against (slow)."""
+    precision: Literal["float64", "float32"] = "float32"
+    """Arithmetic of the network: float32, torch's own default, takes half the time of float64."""
+
+    @model_validator(mode="after")
+    def _fits_in_memory(self) -> Network:
+        weights = sum(a * b for a, b in zip(self.hidden, self.hidden[1:], strict=False))
+        if weights > MAX_WEIGHTS:
+            allowed = f"allowed: at most {MAX_WEIGHTS} between hidden layers"
+            raise refusal(("hidden", f"makes {weights} weights; {allowed}"))
+        return self
+
+
+class Madam(Strict):
+    """Multiplicative adaptive moments, Alg. 1 of the paper."""
+
+    eta: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.001
+    """Learning rate η."""
+    eta_max: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.1
+    """η*, the largest exponent of one update; the paper's 100 η."""
+    sigma_max: Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)] = 1250.0
+    """σ*, the largest magnitude of a weight."""
+    beta: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.999
+    """β, the forgetting factor of the second moment."""
+    bias_correction: bool = False
+    """Divide the second moment by 1 - β^k, as Adam does; the paper's algorithm does not."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Madam:
+        if self.eta_max < self.eta:
+            problem = f"is below eta = {self.eta}; allowed: eta_max >= eta"
+            raise refusal(("eta_max", problem))
+        return self
+
+
+def _resolvable(madam: Madam, network: Network) -> None:
+    """Refuse learning whose smallest steps are rounded away in the network's arithmetic."""
+    eps = float(np.finfo(network.precision).eps)
+    least = f"2^{round(np.log2(eps))} = {eps:.2g}, what {network.precision} resolves"
+    if madam.eta < eps:
+        raise refusal(
+            ("madam.eta", f"would leave every weight as it is; allowed: {least}, or more")
+        )
+    if 1 - madam.beta < eps:
+        problem = f"would never take in a gradient; allowed: 1 - beta of {least}, or more"
+        raise refusal(("madam.beta", problem))
+
+
+class Observer(Strict):
+    """The state observer of Eq. 5."""
+
+    K2: PositiveEach = (30.0,)
+    """Observer gain (1/s): one number, or one for each of the 2n states."""
+    feedback: Literal["stable", "as_printed"] = "stable"
+    """stable: +K₂(X - X̂). as_printed: the paper's sign, which diverges."""
+
+
+class Inertia(Strict):
+    """B₂ = M(q)⁻¹ of the controller's nominal model."""
+
+    kind: Literal["inertia"]
+    """B from a nominal model."""
+    masses: Positives | None = None
+    """Masses that the controller believes (kg); null: the plant's."""
+    lengths: Positives | None = None
+    """Lengths that the controller believes (m); null: the plant's."""
+
+
+class Constant(Strict):
+    """B₂ = b·I: no model at all."""
+
+    kind: Literal["constant"]
+    """B without a model."""
+    b: Positive = 1.0
+    """Control effectiveness (1/(kg·m²))."""
+
+
+Effectiveness = Annotated[Inertia | Constant, Field(discriminator="kind")]
+
+
+class Inversion(Strict):
+    """Dynamic inversion with slack augmentation, Eq. 10 and after."""
+
+    K: PositiveEach = (7.5,)
+    """Tracking gain (1/s): one number, or one for each of the 2n states."""
+    lam: NonNegative = 7.5
+    """λ of the slack matrix B_s = [I; -λI] (1/s). The paper leaves B_s open."""
+    slack_matrix: Matrix | None = None
+    """A general slack matrix B_s, 2n rows of n; it replaces lam."""
+    effectiveness: Effectiveness = Inertia(kind="inertia")
+    """What the controller takes for B."""
+
+    @model_validator(mode="after")
+    def _invertible(self) -> Inversion:
+        if self.slack_matrix is None:
+            return self
+        rows, widths = len(self.slack_matrix), {len(row) for row in self.slack_matrix}
+        if widths != {rows // 2} or rows % 2:
+            problem = "has rows that do not fit; allowed: 2n rows of n numbers each"
+            raise refusal(("slack_matrix", problem))
+        upper = np.array(self.slack_matrix[: rows // 2])
+        if np.linalg.matrix_rank(upper) < rows // 2:
+            problem = "leaves [B B_s] without an inverse; allowed: regular upper n rows"
+            raise refusal(("slack_matrix", problem))
+        return self
+
+
+class DnnMso(Strict):
+    """The paper's controller: the network learns all the dynamics."""
+
+    kind: Literal["dnn_mso"]
+    """DNN-MSO."""
+    inversion: Inversion = Inversion()
+    """From the desired dynamics to a torque."""
+    observer: Observer = Observer()
+    """What the network learns against."""
+    network: Network = Network()
+    """The learned dynamics."""
+    madam: Madam = Madam()
+    """The weight update."""
+
+    @model_validator(mode="after")
+    def _learns(self) -> DnnMso:
+        _resolvable(self.madam, self.network)
+        return self
+
+
+class NoNetwork(Strict):
+    """The paper's controller with the network off: inversion and feedback alone."""
+
+    kind: Literal["no_network"]
+    """Dynamic inversion without learning."""
+    inversion: Inversion = Inversion()
+    """From the desired dynamics to a torque."""
+    observer: Observer = Observer()
+    """What the network learns against."""
+    kinematics: bool = True
+    """Whether q̇ stands in the upper rows of f̂; false leaves all of f̂ at zero."""
+
+
+class ClassicalMso(Strict):
+    """Eq. 4: known dynamics of the nominal model plus a learned uncertainty d̂."""
+
+    kind: Literal["classical_mso"]
+    """The modified state observer with known dynamics."""
+    inversion: Inversion = Inversion()
+    """From the desired dynamics to a torque."""
+    observer: Observer = Observer()
+    """What the network learns against."""
+    network: Network = Network()
+    """The learned dynamics."""
+    madam: Madam = Madam()
+    """The weight update."""
+
+    @model_validator(mode="after")
+    def _needs_a_model(self) -> ClassicalMso:
+        if isinstance(self.inversion.effectiveness, Constant):
+            problem = "leaves classical_mso without a model of the plant; allowed: inertia"
+            raise refusal(("inversion.effectiveness.kind", problem))
+        if self.network.outputs != "full":
+            problem = "has no meaning for classical_mso, which learns a torque; allowed: full"
+            raise refusal(("network.outputs", problem))
+        _resolvable(self.madam, self.network)
+        return self
+
+
+Controller = Annotated[DnnMso | NoNetwork | ClassicalMso, Field(discriminator="kind")]
