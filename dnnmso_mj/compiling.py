@@ -45,9 +45,13 @@ def _compile(function: F, inline: Literal["always", "never"]) -> F:
         # Reassociation lets sums vectorise; NaN and infinity keep their meaning, to be caught.
         fastmath={"reassoc", "contract", "arcp", "nsz"},
     )(function)
-    # Code on disk is valid for these sources too; numba looks at the function's own file alone.
-    on_disk = dispatcher._cache._cache_file
-    on_disk._source_stamp = (_SOURCES, on_disk._source_stamp)
+    # numba looks at the function's own file alone to see whether code on disk is stale, and fails
+    # on an index that names a class which is no more: code of other sources has other files.
+    own = dispatcher._cache._cache_file
+    base = own._index_name.removesuffix(".nbi")
+    dispatcher._cache._cache_file = type(own)(
+        own._cache_path, f"{base}-{_SOURCES[:16]}", own._source_stamp
+    )
     return cast(F, dispatcher)
 
 
