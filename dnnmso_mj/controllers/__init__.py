@@ -10,7 +10,7 @@ import numpy as np
 from dnnmso_mj.inversion import DynamicInversion
 from dnnmso_mj.monitors import Monitors
 from dnnmso_mj.plant import Mjcf, NominalModel
-from dnnmso_mj.scenario import ClassicalMso, DnnMso, NoNetwork, Scenario
+from dnnmso_mj.scenario import ClassicalMso, DnnMso, DnnMsoReplay, NoNetwork, Scenario
 
 if TYPE_CHECKING:
     from dnnmso_mj.tick import Loop
@@ -119,6 +119,7 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
     """
     from dnnmso_mj.controllers.classical_mso import ClassicalMsoController
     from dnnmso_mj.controllers.dnn_mso import DnnMsoController
+    from dnnmso_mj.controllers.dnn_mso_replay import DnnMsoReplayController
     from dnnmso_mj.controllers.no_network import NoNetworkController
 
     nominal = NominalModel(scenario, mjcf)
@@ -126,6 +127,8 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
     match spec:
         case DnnMso():
             return DnnMsoController(spec, n, dt, scenario.seed, nominal, watch=watch)
+        case DnnMsoReplay():
+            return DnnMsoReplayController(spec, n, dt, scenario.seed, nominal, watch=watch)
         case NoNetwork():
             return NoNetworkController(spec, n, dt, nominal)
         case ClassicalMso():
