@@ -5,7 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from dnnmso_mj.scenario.controller import effectiveness, inversion
+
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from dnnmso_mj.scenario import Scenario
 
 MAX_TICKS = 100_000_000
@@ -20,6 +24,7 @@ def contradictions(scenario: Scenario) -> list[Problem]:
         *_times_below_dt(scenario),
         *_observer_gain(scenario),
         *_stalls(scenario),
+        *_events(scenario),
         *_sizes(scenario),
     ]
 
@@ -51,6 +56,8 @@ def _times_below_dt(scenario: Scenario) -> Iterator[Problem]:
 
 def _observer_gain(scenario: Scenario) -> Iterator[Problem]:
     most = 2.0 / scenario.dt
+    if not hasattr(scenario.controller, "observer"):
+        return
     if max(scenario.controller.observer.K2) >= most:
         problem = f"makes a sampled observer unstable; allowed: K2 < 2/dt = {most:g}"
         yield "controller.observer.K2", problem
@@ -63,6 +70,18 @@ def _stalls(scenario: Scenario) -> Iterator[Problem]:
                 f"real_time.stalls.{k}.at",
                 f"is at the end or after it; allowed: below {scenario.duration:g} s",
             )
+
+
+def _events(scenario: Scenario) -> Iterator[Problem]:
+    for k, event in enumerate(scenario.events):
+        if event.at > scenario.duration - 0.5 * scenario.dt:
+            yield (
+                f"events.{k}.at",
+                f"is at the end or after it; allowed: below {scenario.duration:g} s",
+            )
+        if event.kind == "push" and event.duration < scenario.dt * (1 - 1e-9):
+            allowed = f"allowed: dt = {scenario.dt} or more"
+            yield f"events.{k}.duration", f"is less than one step; {allowed}"
 
 
 def _sizes(scenario: Scenario) -> Iterator[Problem]:
@@ -80,18 +99,37 @@ def _vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:
     if scenario.plant.masses:
         yield "plant.masses", len(scenario.plant.masses), {n}
     yield from _reference_vectors(scenario, n)
-    inversion = scenario.controller.inversion
-    yield "controller.inversion.K", len(inversion.K), {1, 2 * n}
-    if inversion.slack_matrix:
-        yield "controller.inversion.slack_matrix", len(inversion.slack_matrix), {2 * n}
-    if inversion.effectiveness.kind == "inertia":
+    yield from _controller_vectors(scenario, n)
+    yield from _numbers("imperfections", scenario.imperfections, n)
+    yield from _numbers("imperfections.friction", scenario.imperfections.friction, n)
+    for k, event in enumerate(scenario.events):
+        if event.kind == "push" and event.torque:
+            yield f"events.{k}.torque", len(event.torque), {1, n}
+
+
+def _numbers(path: str, part: BaseModel, n: int) -> Iterator[tuple[str, int, set[int]]]:
+    """Every list of a part: one number for all joints, or one for each."""
+    for name, values in part:
+        if isinstance(values, tuple):
+            yield f"{path}.{name}", len(values), {1, n}
+
+
+def _controller_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:
+    controller, path = scenario.controller, "controller"
+    law = inversion(controller)
+    if law is not None:
+        path = "controller.inversion"
+        yield f"{path}.K", len(law.K), {1, 2 * n}
+        if law.slack_matrix:
+            yield f"{path}.slack_matrix", len(law.slack_matrix), {2 * n}
+    believed = effectiveness(controller)
+    if believed.kind == "inertia":
         for name in ("masses", "lengths"):
-            values = getattr(inversion.effectiveness, name)
+            values = getattr(believed, name)
             if values:
-                yield f"controller.inversion.effectiveness.{name}", len(values), {n}
-    yield "controller.observer.K2", len(scenario.controller.observer.K2), {1, 2 * n}
-    if scenario.imperfections.torque_limit:
-        yield "imperfections.torque_limit", len(scenario.imperfections.torque_limit), {1, n}
+                yield f"{path}.effectiveness.{name}", len(values), {n}
+    if hasattr(controller, "observer"):
+        yield "controller.observer.K2", len(controller.observer.K2), {1, 2 * n}
 
 
 def _reference_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:

@@ -35,6 +35,7 @@ from dnnmso_mj.mujoco_calls import (
 )
 from dnnmso_mj.scenario import Inertia, Scenario
 from dnnmso_mj.scenario import Plant as PlantSpec
+from dnnmso_mj.scenario.controller import effectiveness
 from dnnmso_mj.unmodelled import refuse_unmodelled
 
 Array = np.ndarray
@@ -206,7 +207,8 @@ class Plant:
 
     Attributes:
         q, qd: joint angle (n,) rad and velocity (n,) rad/s: live, read-only views.
-        model: MuJoCo's model.
+        applied: torque (n,) N·m on the joints beside the motors': live, held until changed.
+        model: MuJoCo's model, this plant's own.
         view: the same robot for compiled code.
     """
 
@@ -220,6 +222,7 @@ class Plant:
         data = self._data = mujoco.MjData(self.model)
         self.q: Array = _read_only(data.qpos)
         self.qd: Array = _read_only(data.qvel)
+        self.applied: Array = data.qfrc_applied
         self.view = PlantView(
             model=self.model._address,
             data=data._address,
@@ -235,6 +238,14 @@ class Plant:
         mujoco.mj_resetData(self.model, self._data)
         self._data.qpos[:] = q
         self._data.qvel[:] = qd
+
+    def damp(self, viscous: Array) -> None:
+        """Give the joints viscous friction (n,) N·m·s/rad; every integrator takes it in."""
+        self.model.dof_damping[:] = viscous
+
+    def body_frame(self, body: int) -> tuple[Array, Array]:
+        """Origin (3,) m and rotation (9,) of a body in the world: live views."""
+        return self._data.xpos[body], self._data.xmat[body]
 
     def acceleration(self, tau: Array) -> Array:
         """True q̈ (n,) rad/s² at the present state under τ (n,) N·m: a live view."""
@@ -294,8 +305,8 @@ class NominalModel:
     """
 
     def __init__(self, scenario: Scenario, mjcf: Mjcf) -> None:
-        effectiveness = scenario.controller.inversion.effectiveness
-        known = effectiveness if isinstance(effectiveness, Inertia) else None
+        believed = effectiveness(scenario.controller)
+        known = believed if isinstance(believed, Inertia) else None
         self.model = deepcopy(_nominal_model(scenario.plant, known, scenario.dt, mjcf))
         data = self._data = mujoco.MjData(self.model)
         self.view = Nominal(

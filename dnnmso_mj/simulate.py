@@ -15,12 +15,27 @@ from numba.core import event
 
 from dnnmso_mj.compile_loop import compile_elsewhere
 from dnnmso_mj.compiling import CompileNotice
-from dnnmso_mj.controllers import Controller, build_controller, compiled_ticks
+from dnnmso_mj.controllers import (
+    LEARNING,
+    Controller,
+    Inputs,
+    build_controller,
+    compiled_ticks,
+)
 from dnnmso_mj.errors import NonFiniteError
-from dnnmso_mj.imperfections import build_actuators
+from dnnmso_mj.imperfections import (
+    SensorBank,
+    Tip,
+    build_actuators,
+    build_loads,
+    read,
+    start_actuators,
+    start_loads,
+)
 from dnnmso_mj.plant import RK4, Mjcf, NominalModel, Plant
 from dnnmso_mj.reference import Reference
 from dnnmso_mj.scenario import Constant, Scenario
+from dnnmso_mj.scenario.controller import effectiveness, inversion, lookahead
 from dnnmso_mj.theory import build_bounds, start_bounds
 from dnnmso_mj.tick import (
     CHUNK_START,
@@ -41,6 +56,7 @@ from dnnmso_mj.tick import (
     begin_tick,
     end_tick,
 )
+from dnnmso_mj.timeline import plan, tip_of_interest
 from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
 
 Array = np.ndarray
@@ -103,26 +119,31 @@ class Simulation:
         self.layout = StepLayout(n, self.controller.n_layers)
         self._columns = {name: self.layout.slices[name].start for name in CHANGES}
         self._nominal = NominalModel(scenario, mjcf)
-        effectiveness = scenario.controller.inversion.effectiveness
+        believed, law = effectiveness(scenario.controller), inversion(scenario.controller)
         bounds = build_bounds(
-            scenario.controller.inversion,
+            law,
             n,
             scenario.dt,
             first_order=self.plant.view.integrator != RK4,
         )
-        q_ref, qd_ref, qdd_ref = np.zeros((3, CHUNK, n))
+        self._tip = Tip(self.plant.model, scenario.plant) if tip_of_interest(scenario) else None
+        self._sensors = SensorBank(scenario.imperfections, n, scenario.dt, scenario.seed, CHUNK)
+        self._lookahead = lookahead(scenario.controller)
+        reference = np.zeros((CHUNK, 3 * n))
         x, x_ref, xd_ref, e_track, f_true, f_err = np.zeros((6, 2 * n))
         self.world = World(
             plant=self.plant.view,
-            actuators=build_actuators(scenario.imperfections, n),
+            sensors=self._sensors.view,
+            actuators=build_actuators(scenario.imperfections, n, scenario.dt),
+            loads=build_loads(scenario, self.plant, self._tip),
             bounds=bounds,
             pace=pace,
-            q_ref=q_ref,
-            qd_ref=qd_ref,
-            qdd_ref=qdd_ref,
+            reference=reference,
+            ahead=np.zeros_like(reference) if self._lookahead else reference,
             x=x,
             x_ref=x_ref,
             xd_ref=xd_ref,
+            inputs=Inputs.zeros(n),
             e_track=e_track,
             f_true=f_true,
             f_err=f_err,
@@ -130,13 +151,15 @@ class Simulation:
             qdd=np.zeros(n),
             L=np.zeros((n, n)),
             nominal=self._nominal.view,
-            b=effectiveness.b if isinstance(effectiveness, Constant) else 0.0,
+            b=believed.b if isinstance(believed, Constant) else 0.0,
+            inverts=law is not None,
             rows=np.zeros((LARGEST_BLOCK, self.layout.width)),
             counts=np.zeros(N_COUNTS, np.int64),
             late_ns=np.zeros(1, np.int64),
             timespec=np.zeros(2, np.int64),
             dt=scenario.dt,
         )
+        self._plan = plan(scenario, self.world.loads, self._tip, self.world.inputs.frozen)
         self._flags = dict.fromkeys(CHANGES, False)
         self._first_state: dict[str, Array] | None = None
 
@@ -184,7 +207,7 @@ class Simulation:
                 state, world = self.controller.state(), self.world
                 self._start()
                 begin_tick(world, 0)
-                self._command = self.controller.update(world.x, world.x_ref, world.xd_ref)
+                self._command = self.controller.update(world.inputs)
                 end_tick(world, self._command, 0)
                 self.controller.restore(state)
         self._start()
@@ -193,14 +216,29 @@ class Simulation:
         scenario, world, n = self.scenario, self.world, self.scenario.n_joints
         x = np.zeros(2 * n)
         x[:n], x[n:] = scenario.initial.q, scenario.initial.qd
+        if self._tip is not None:
+            self._tip.carry(0.0)
         self.plant.reset(x[:n], x[n:])
-        self.controller.reset(x)
+        start_actuators(world.actuators)
+        start_loads(world.loads)
+        self._sensors.start(x)
         q_ref, qd_ref, _ = self.reference.sample(np.zeros(1))
         start_bounds(world.bounds, x - np.concatenate([q_ref[0], qd_ref[0]]))
         world.tau[:] = 0.0
+        world.inputs.frozen[0] = LEARNING
+        self._happened = 0
         world.counts[:] = 0
-        self._sample_reference(0)
+        self._begin_chunk(0)
+        self.controller.reset(self._first_reading(x))
         self._flags = dict.fromkeys(CHANGES, False)
+
+    def _first_reading(self, x: Array) -> Array:
+        """What the sensors say of the start x (2n,), and will say again at tick 0."""
+        if self._sensors.view.perfect:
+            return x
+        reading = np.zeros_like(x)
+        read(self._sensors.view, x, 0, 0, reading)
+        return reading
 
     def _loop(self, recorder: Recorder, progress: Progress | None) -> None:
         n_ticks, dt = self.scenario.n_ticks, self.scenario.dt
@@ -212,8 +250,8 @@ class Simulation:
             if first % snapshot_every == 0:
                 recorder.snapshot("controller", first * dt, self.controller.state())
             if first % CHUNK == 0 and first > 0:
-                self._sample_reference(first)
-            ends = [first + block, n_ticks]
+                self._begin_chunk(first)
+            ends = [first + block, n_ticks, self._happen(first, recorder)]
             ends += [(first // every + 1) * every for every in (CHUNK, snapshot_every)]
             count = min(ends) - first
             self._run_block(first, count, recorder)
@@ -221,11 +259,25 @@ class Simulation:
                 progress(count)
         recorder.snapshot("controller", n_ticks * dt, self.controller.state())
 
-    def _sample_reference(self, first: int) -> None:
+    def _happen(self, tick: int, recorder: Recorder) -> int:
+        """Let every event up to this tick happen; the tick of the next one, or the last."""
+        for happening in self._plan[self._happened :]:
+            if happening.tick > tick:
+                return happening.tick
+            self._happened += 1
+            happening.act()
+            recorder.event(Event(tick * self.scenario.dt, "info", happening.message))
+        return self.scenario.n_ticks
+
+    def _begin_chunk(self, first: int) -> None:
+        """Reference and random numbers of the ticks from `first` on."""
         world = self.world
         world.counts[CHUNK_START] = first
+        self._sensors.draw()
         t = np.arange(first, first + CHUNK) * self.scenario.dt
-        world.q_ref[:], world.qd_ref[:], world.qdd_ref[:] = self.reference.sample(t)
+        world.reference[:] = np.hstack(self.reference.sample(t))
+        if self._lookahead:
+            world.ahead[:] = np.hstack(self.reference.sample(t + self._lookahead))
 
     def _run_block(self, first: int, count: int, recorder: Recorder) -> None:
         """Ticks first to first + count, and their rows to the recorder.
@@ -254,7 +306,7 @@ class Simulation:
         for k in range(first, first + count):
             if begin_tick(world, k):
                 began = time.perf_counter_ns()
-                self._command = self.controller.update(world.x, world.x_ref, world.xd_ref)
+                self._command = self.controller.update(world.inputs)
                 world.counts[TOOK_NS] = time.perf_counter_ns() - began
             if end_tick(world, self._command, k):
                 return

@@ -110,9 +110,7 @@ def _limit(tau_cmd: Array, limit: Array, change: Array, given: Array) -> bool:
 
 
 @compiled
-def _respond(
-    k: int, given: Array, past: Array, lagged: Array, parts: Array, tau: Array
-) -> None:
+def _respond(k: int, given: Array, past: Array, lagged: Array, parts: Array, tau: Array) -> None:
     """Delay and lag of tick k's command: its period's mean into `tau`."""
     size = len(past)
     whole = size - 2

@@ -1,4 +1,4 @@
-"""What happens to the robot during a run."""
+"""What happens to a run at a set time."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from dnnmso_mj.scenario.fields import (
     refusal,
 )
 
-Force = Annotated[
-    tuple[Finite, ...], Field(min_length=2, max_length=3), BeforeValidator(as_tuple)
-]
+Force = Annotated[tuple[Finite, ...], Field(min_length=2, max_length=3), BeforeValidator(as_tuple)]
 
 
 class Payload(Strict):
@@ -57,3 +55,17 @@ class Push(Strict):
         if not any(self.torque or ()) and not any(self.force or ()):
             raise refusal(("torque", "is zero or not given, and so is force; allowed: one of them"))
         return self
+
+
+class Freeze(Strict):
+    """The controller stops learning."""
+
+    kind: Literal["freeze"]
+    """An end of learning."""
+    at: NonNegative
+    """When (s)."""
+    what: Literal["model", "all"] = "model"
+    """model: weights and adapted parameters. all: its estimate of the disturbance goes as well."""
+
+
+Event = Annotated[Payload | Push | Freeze, Field(discriminator="kind")]
