@@ -47,6 +47,8 @@ INTEGRATORS = {
 }
 RK4, EULER = int(INTEGRATORS["rk4"]), int(INTEGRATORS["euler"])
 
+TIP = "tip"  # the site at the far end of the last link
+
 LOGGER = logging.getLogger(__name__)
 
 
@@ -114,6 +116,9 @@ def build_spec(plant: PlantSpec, dt: float, mjcf: Mjcf) -> mujoco.MjSpec:
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     if plant.masses is not None and plant.lengths is not None:
         set_links(spec, plant.links, plant.masses, plant.lengths)
+        if spec.site(TIP) is None:
+            tip = spec.body(f"link{len(plant.lengths)}")
+            tip.add_site(name=TIP, pos=[plant.lengths[-1], 0.0, 0.0])
     return spec
 
 
@@ -242,10 +247,6 @@ class Plant:
     def damp(self, viscous: Array) -> None:
         """Give the joints viscous friction (n,) N·m·s/rad; every integrator takes it in."""
         self.model.dof_damping[:] = viscous
-
-    def body_frame(self, body: int) -> tuple[Array, Array]:
-        """Origin (3,) m and rotation (9,) of a body in the world: live views."""
-        return self._data.xpos[body], self._data.xmat[body]
 
     def acceleration(self, tau: Array) -> Array:
         """True q̈ (n,) rad/s² at the present state under τ (n,) N·m: a live view."""

@@ -23,15 +23,10 @@ from dnnmso_mj.controllers import (
     compiled_ticks,
 )
 from dnnmso_mj.errors import NonFiniteError
-from dnnmso_mj.imperfections import (
-    SensorBank,
-    Tip,
-    build_actuators,
-    build_loads,
-    read,
-    start_actuators,
-    start_loads,
-)
+from dnnmso_mj.imperfections.actuators import build_actuators, start_actuators
+from dnnmso_mj.imperfections.loads import build_loads, start_loads
+from dnnmso_mj.imperfections.sensors import SensorBank, sense
+from dnnmso_mj.imperfections.tip import Tip
 from dnnmso_mj.plant import RK4, Mjcf, NominalModel, Plant
 from dnnmso_mj.reference import Reference
 from dnnmso_mj.scenario import Constant, Scenario
@@ -126,7 +121,9 @@ class Simulation:
             scenario.dt,
             first_order=self.plant.view.integrator != RK4,
         )
-        self._tip = Tip(self.plant.model, scenario.plant) if tip_of_interest(scenario) else None
+        self._tip = (
+            Tip(self.plant.model, scenario.plant.model) if tip_of_interest(scenario) else None
+        )
         self._sensors = SensorBank(scenario.imperfections, n, scenario.dt, scenario.seed, CHUNK)
         self._lookahead = lookahead(scenario.controller)
         reference = np.zeros((CHUNK, 3 * n))
@@ -234,10 +231,9 @@ class Simulation:
 
     def _first_reading(self, x: Array) -> Array:
         """What the sensors say of the start x (2n,), and will say again at tick 0."""
-        if self._sensors.view.perfect:
-            return x
-        reading = np.zeros_like(x)
-        read(self._sensors.view, x, 0, 0, reading)
+        reading = x.copy()
+        if not self._sensors.view.perfect:
+            sense(self._sensors.view, x, 0, 0, reading)
         return reading
 
     def _loop(self, recorder: Recorder, progress: Progress | None) -> None:

@@ -19,7 +19,9 @@ import numpy as np
 
 from dnnmso_mj.clock import now_ns, sleep_until
 from dnnmso_mj.compiling import compiled, copy, inner
-from dnnmso_mj.imperfections import Actuators, Loads, Sensors, actuate, load, sense
+from dnnmso_mj.imperfections.actuators import GIVEN, Actuators, actuate
+from dnnmso_mj.imperfections.loads import BEFORE, Loads, load
+from dnnmso_mj.imperfections.sensors import Sensors, sense
 from dnnmso_mj.inversion import solve_spd
 from dnnmso_mj.plant import Nominal, PlantView, inertia, integrate, solve_inertia
 from dnnmso_mj.theory import TrackingBounds, begin_period, end_period
@@ -208,7 +210,7 @@ def _watchdog(world: World) -> Array:
     n, tau = world.tau.size, world.qdd
     for j in range(n):
         if world.pace.watchdog == HOLD:
-            tau[j] = world.actuators.given[j]
+            tau[j] = world.actuators.held[GIVEN, j]
         elif world.pace.watchdog == ZERO:
             tau[j] = 0.0
         else:
@@ -222,7 +224,7 @@ def _end_period(world: World, tau: Array) -> None:
     n, loads = tau.size, world.loads
     change = world.f_true[:n]
     for j in range(n):
-        change[j] = (world.tau[j] - tau[j]) + (loads.before[j] - loads.torque[j])
+        change[j] = (world.tau[j] - tau[j]) + (loads.held[BEFORE, j] - loads.torque[j])
     solve_inertia(world.plant, change, world.qdd)
     for j in range(n):
         world.qdd[j] += world.plant.qacc[j]

@@ -10,7 +10,8 @@ import numpy as np
 
 from dnnmso_mj.controllers import MODEL_ALONE, MODEL_FROZEN
 from dnnmso_mj.errors import ScenarioError
-from dnnmso_mj.imperfections import Loads, Tip
+from dnnmso_mj.imperfections.loads import Loads
+from dnnmso_mj.imperfections.tip import Tip
 from dnnmso_mj.scenario import Freeze, Payload, Push, Scenario, expand
 
 Array = np.ndarray
@@ -109,7 +110,7 @@ def _listed(values: Array) -> str:
 
 
 def _push(loads: Loads, wrench: Array) -> None:
-    loads.push[:], loads.force[:] = wrench[:-3], wrench[-3:]
+    loads.push[:] = wrench
 
 
 def _set(array: Array, value: int) -> None:

@@ -15,24 +15,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.compiling import compiled, inner
 from dnnmso_mj.scenario import Imperfections, expand
 
 Array = np.ndarray
 
 # Entries of a row of `Actuators.parts`.
 DECAY, INPUT, STATE = range(3)
+# Rows of `Actuators.held`.
+GIVEN, LAGGED = range(2)
 
 
 class Actuators(NamedTuple):
     """The drives, each joint with its own limits."""
 
     tau: Array  # (n,) N·m, what reaches the joints
-    limit: Array  # (n,) N·m; infinite without one
-    change: Array  # (n,) N·m, largest change in a period; infinite without one
-    given: Array  # (n,) N·m, the last command after both limits
-    past: Array  # (d + 2, n) N·m, commands as given, a ring
-    lagged: Array  # (n,) N·m, output of the lag at the end of the last period
+    limits: Array  # (2, n) N·m: of a torque, of its change in a period; infinite without one
+    held: Array  # (2, n) N·m: the last command after both limits; the lag's output
+    past: Array  # (d + 2, n) N·m, commands after both limits, a ring
     parts: Array  # (2, 3): see `_parts`
     prompt: bool  # whether there is neither delay nor lag
 
@@ -41,14 +41,14 @@ def build_actuators(spec: Imperfections, n_joints: int, dt: float) -> Actuators:
     """The actuators of a scenario with the control period dt (s), at rest."""
     n = n_joints
     limit, rate = spec.torque_limit, spec.torque_rate
+    most = np.full(n, np.inf) if limit is None else expand(limit, n)
+    change = np.full(n, np.inf) if rate is None else expand(rate, n) * dt
     whole, fraction = split(spec.actuator_delay / dt)
     return Actuators(
         tau=np.zeros(n),
-        limit=np.full(n, np.inf) if limit is None else expand(limit, n),
-        change=np.full(n, np.inf) if rate is None else expand(rate, n) * dt,
-        given=np.zeros(n),
+        limits=np.array([most, change]),
+        held=np.zeros((2, n)),
         past=np.zeros((whole + 2, n)),
-        lagged=np.zeros(n),
         parts=_parts(fraction, spec.actuator_lag / dt),
         prompt=spec.actuator_delay == 0.0 and spec.actuator_lag == 0.0,
     )
@@ -76,49 +76,46 @@ def _parts(fraction: float, lag: float) -> Array:
 
 def start_actuators(actuators: Actuators) -> None:
     """As before the first command: no torque, and none on its way."""
-    for array in (actuators.tau, actuators.given, actuators.past, actuators.lagged):
+    for array in (actuators.tau, actuators.held, actuators.past):
         array[:] = 0.0
 
 
 @inner
 def actuate(actuators: Actuators, tau_cmd: Array, k: int) -> bool:
     """Pass tick k's command (n,) N·m on; whether a limit changed it."""
-    saturated = _limit(tau_cmd, actuators.limit, actuators.change, actuators.given)
-    if actuators.prompt:
-        copy(actuators.given, actuators.tau)
-    else:
-        _respond(
-            k, actuators.given, actuators.past, actuators.lagged, actuators.parts, actuators.tau
-        )
+    saturated = _limit(tau_cmd, actuators.limits, actuators.held, actuators.tau)
+    if not actuators.prompt:
+        _respond(k, actuators.held, actuators.past, actuators.parts, actuators.tau)
     return saturated
 
 
 @compiled
-def _limit(tau_cmd: Array, limit: Array, change: Array, given: Array) -> bool:
-    """Clamp to ±limit, then to `given` ± change; N.B. what is not a number stays so."""
+def _limit(tau_cmd: Array, limits: Array, held: Array, tau: Array) -> bool:
+    """Clamp the torque, then its change; N.B. what is not a number stays so."""
     saturated = False
     for i in range(tau_cmd.size):
-        tau = tau_cmd[i]
-        if abs(tau) > limit[i]:
-            tau = math.copysign(limit[i], tau)
+        most, change = limits[0, i], limits[1, i]
+        wanted = tau_cmd[i]
+        if abs(wanted) > most:
+            wanted = math.copysign(most, wanted)
             saturated = True
-        if abs(tau - given[i]) > change[i]:
-            tau = given[i] + math.copysign(change[i], tau - given[i])
+        if abs(wanted - held[GIVEN, i]) > change:
+            wanted = held[GIVEN, i] + math.copysign(change, wanted - held[GIVEN, i])
             saturated = True
-        given[i] = tau
+        tau[i] = held[GIVEN, i] = wanted
     return saturated
 
 
 @compiled
-def _respond(k: int, given: Array, past: Array, lagged: Array, parts: Array, tau: Array) -> None:
-    """Delay and lag of tick k's command: its period's mean into `tau`."""
+def _respond(k: int, held: Array, past: Array, parts: Array, tau: Array) -> None:
+    """Delay and lag: from tick k's command in `tau` to its period's mean."""
     size = len(past)
     whole = size - 2
-    for i in range(given.size):
-        past[k % size, i] = given[i]
-        y, mean = lagged[i], 0.0
+    for i in range(tau.size):
+        past[k % size, i] = tau[i]
+        y, mean = held[LAGGED, i], 0.0
         for part in range(2):
             u = past[(k - whole - 1 + part) % size, i]
             mean += u * parts[part, INPUT] + (y - u) * parts[part, STATE]
             y = u + (y - u) * parts[part, DECAY]
-        tau[i], lagged[i] = mean, y
+        tau[i], held[LAGGED, i] = mean, y

@@ -54,7 +54,7 @@ def rub(
         qd: q̇ (n,) rad/s.
         qdd: q̈ (n,) rad/s² without friction.
         law: see `friction_law`.
-        scratch: (2, n, n), the identity first.
+        scratch: (2 or more, n or more, n), the identity first.
         tau: in and out.
     """
     n = qd.size

@@ -10,32 +10,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.compiling import compiled, inner
 from dnnmso_mj.imperfections.friction import friction_law, rub
 from dnnmso_mj.imperfections.tip import Tip
-from dnnmso_mj.mujoco_calls import mj_comPos, mj_jac, mj_kinematics
+from dnnmso_mj.mujoco_calls import mj_comPos, mj_jacSite, mj_kinematics
 from dnnmso_mj.plant import Plant, PlantView, forward
 from dnnmso_mj.scenario import Push, Scenario, expand
 
 Array = np.ndarray
 
+# Rows of `Loads.held`.
+BEFORE, FRICTION = range(2)
+
 
 class Loads(NamedTuple):
-    """What acts beside the motors."""
+    """What acts beside the motors. N.B. few arrays: each makes the loop compile longer."""
 
     torque: Array  # (n,) N·m in this period: all of it, as MuJoCo sees it
-    before: Array  # (n,) N·m in the period before
-    push: Array  # (n,) N·m on the joints from outside
-    force: Array  # (3,) N at the tip from outside
-    place: Array  # (3,) m, the tip in its body's frame
-    body: int
-    origin: Array  # (3,) m, of that body in the world, and
-    axes: Array  # (9,) its rotation, both MuJoCo's own
+    held: Array  # (2, n) N·m: all of it in the period before; the dry friction in it
+    push: Array  # (n + 3,) from outside: N·m on the joints, N at the tip
     law: Array  # (3, n) of dry friction
-    dry_torque: Array  # (n,) N·m, dry friction alone
-    scratch: Array  # (2, n, n), the identity first
-    point: Array  # (3,) scratch
-    jacobian: Array  # (3, n) scratch
+    scratch: Array  # (3, max(n, 3), n): the identity first
+    site: int  # MuJoCo's, of the tip
     acting: bool  # whether anything may ever act
     dry: bool  # whether there is dry friction
 
@@ -50,22 +46,15 @@ def build_loads(scenario: Scenario, plant: Plant, tip: Tip | None) -> Loads:
     """
     n, friction = scenario.n_joints, scenario.imperfections.friction
     plant.damp(expand(friction.viscous, n))
-    body = tip.body if tip else 0
-    origin, axes = plant.body_frame(body)
+    scratch = np.zeros((3, max(n, 3), n))
+    scratch[0, :n] = np.eye(n)
     return Loads(
         torque=plant.applied,
-        before=np.zeros(n),
-        push=np.zeros(n),
-        force=np.zeros(3),
-        place=tip.place if tip else np.zeros(3),
-        body=body,
-        origin=origin,
-        axes=axes,
+        held=np.zeros((2, n)),
+        push=np.zeros(n + 3),
         law=friction_law(friction, n),
-        dry_torque=np.zeros(n),
-        scratch=np.stack([np.eye(n), np.zeros((n, n))]),
-        point=np.zeros(3),
-        jacobian=np.zeros((3, n)),
+        scratch=scratch,
+        site=tip.site if tip else -1,
         acting=friction.is_dry or any(isinstance(event, Push) for event in scenario.events),
         dry=friction.is_dry,
     )
@@ -73,7 +62,7 @@ def build_loads(scenario: Scenario, plant: Plant, tip: Tip | None) -> Loads:
 
 def start_loads(loads: Loads) -> None:
     """As before the first period: nothing acts."""
-    for array in (loads.torque, loads.before, loads.push, loads.force, loads.dry_torque):
+    for array in (loads.torque, loads.held, loads.push):
         array[:] = 0.0
 
 
@@ -81,9 +70,9 @@ def start_loads(loads: Loads) -> None:
 def load(loads: Loads, plant: PlantView, tau: Array, dt: float) -> None:
     """Begin a period in which the motors give τ (n,) N·m: true q̈ under it and all loads."""
     if loads.acting:
-        copy(loads.torque, loads.before)
-        copy(loads.push, loads.torque)
-        _push_tip(loads, plant.model, plant.data)
+        _push(
+            plant.model, plant.data, loads.site, loads.push, loads.held, loads.torque, loads.scratch
+        )
         if loads.dry:
             forward(plant, tau)
             rub(
@@ -94,26 +83,28 @@ def load(loads: Loads, plant: PlantView, tau: Array, dt: float) -> None:
                 plant.qacc,
                 loads.law,
                 loads.scratch,
-                loads.dry_torque,
+                loads.held[FRICTION],
             )
             for j in range(tau.size):
-                loads.torque[j] += loads.dry_torque[j]
+                loads.torque[j] += loads.held[FRICTION, j]
     forward(plant, tau)
 
 
 @compiled
-def _push_tip(loads: Loads, model: int, data: int) -> None:
-    """Add Jᵀ f to the torques."""
-    force, point, jacobian = loads.force, loads.point, loads.jacobian
-    if force[0] == 0.0 and force[1] == 0.0 and force[2] == 0.0:
+def _push(
+    model: int, data: int, site: int, push: Array, held: Array, torque: Array, scratch: Array
+) -> None:
+    """The last period's torque into `held`, and what pushes now into `torque`."""
+    n = torque.size
+    for j in range(n):
+        held[BEFORE, j] = torque[j]
+        torque[j] = push[j]
+    if push[n] == 0.0 and push[n + 1] == 0.0 and push[n + 2] == 0.0:
         return
+    jacobian = scratch[2]
     mj_kinematics(model, data)
     mj_comPos(model, data)
-    for i in range(3):
-        point[i] = loads.origin[i]
-        for j in range(3):
-            point[i] += loads.axes[3 * i + j] * loads.place[j]
-    mj_jac(model, data, jacobian.ctypes.data, 0, point.ctypes.data, loads.body)
-    for j in range(loads.torque.size):
+    mj_jacSite(model, data, jacobian.ctypes.data, 0, site)
+    for j in range(n):
         for i in range(3):
-            loads.torque[j] += jacobian[i, j] * force[i]
+            torque[j] += jacobian[i, j] * push[n + i]

@@ -33,11 +33,9 @@ class Sensors(NamedTuple):
     """The sensors as compiled code sees them."""
 
     past: Array  # (m, 2n) true states, a ring
-    error: Array  # (chunk, 2n) bias, drift and noise of each tick
-    age: Array  # (chunk,) of each tick's reading, in periods
-    step: Array  # (n,) rad of the encoder; 0 without one
+    error: Array  # (chunk, 2n + 1) bias, drift and noise of each tick; its reading's age in periods
     last: Array  # (2n,) the last reading
-    velocity: Array  # (2,) a, and (1 − a)/dt; for velocity by difference
+    settings: Array  # (n + 2,) rad, the encoder's steps or 0; a and (1 − a)/dt of the difference
     differenced: bool
     perfect: bool
 
@@ -66,17 +64,16 @@ class SensorBank:
         self._bias = _each(spec.position_bias, spec.velocity_bias, n)
         self._delay, self._jitter = spec.sensor_delay / dt, spec.jitter / dt
         counts, smooth = spec.encoder_counts, spec.velocity_filter
+        steps = np.zeros(n) if counts is None else 2.0 * np.pi / expand(counts, n)
         decay = math.exp(-dt / smooth) if smooth > 0.0 else 0.0
         differenced = spec.velocity_from == "difference"
         erring = np.concatenate([self._white, self._walk, self._bias]).any()
         late = self._delay + self._jitter
         self.view = Sensors(
             past=np.zeros((math.ceil(late) + 2, 2 * n)),
-            error=np.zeros((chunk, 2 * n)),
-            age=np.zeros(chunk),
-            step=np.zeros(n) if counts is None else 2.0 * np.pi / expand(counts, n),
+            error=np.zeros((chunk, 2 * n + 1)),
             last=np.zeros(2 * n),
-            velocity=np.array([decay, (1.0 - decay) / dt]),
+            settings=np.array([*steps, decay, (1.0 - decay) / dt]),
             differenced=differenced,
             perfect=not (erring or late or counts or differenced),
         )
@@ -94,7 +91,7 @@ class SensorBank:
         view = self.view
         if view.perfect:
             return
-        chunk, n = len(view.age), view.step.size
+        chunk, n = len(view.error), view.last.size // 2
 
         def normal(positions: int, velocities: int) -> Array:
             drawn = [self._streams[k].standard_normal((chunk, n)) for k in (positions, velocities)]
@@ -104,8 +101,8 @@ class SensorBank:
         drift = np.cumsum(np.vstack([self._drift, walk]), axis=0)
         self._drift = drift[-1:]
         white = self._white * normal(POSITION_NOISE, VELOCITY_NOISE)
-        view.error[:] = self._bias + drift[:-1] + white
-        view.age[:] = self._delay + self._jitter * self._streams[JITTER].random(chunk)
+        view.error[:, :-1] = self._bias + drift[:-1] + white
+        view.error[:, -1] = self._delay + self._jitter * self._streams[JITTER].random(chunk)
 
 
 def _each(positions: tuple[float, ...], velocities: tuple[float, ...], n: int) -> Array:
@@ -118,26 +115,31 @@ def sense(sensors: Sensors, x: Array, k: int, i: int, out: Array) -> None:
     if sensors.perfect:
         copy(x, out)
     else:
-        read(sensors, x, k, i, out)
+        _recall(sensors.past, x, k, sensors.error[i], out)
+        _resolve(sensors.settings, sensors.differenced, k, sensors.last, out)
 
 
 @compiled
-def read(sensors: Sensors, x: Array, k: int, i: int, out: Array) -> None:
-    """`sense` of sensors that are not perfect."""
-    past, last, n = sensors.past, sensors.last, sensors.step.size
-    size = len(past)
-    whole = int(sensors.age[i])
-    older = sensors.age[i] - whole
-    for j in range(2 * n):
+def _recall(past: Array, x: Array, k: int, error: Array, out: Array) -> None:
+    """The state of some time ago, with its error."""
+    size, age = len(past), error[x.size]
+    whole = int(age)
+    for j in range(x.size):
         past[k % size, j] = x[j]
         newer = past[(k - whole) % size, j]
-        oldest = past[(k - whole - 1) % size, j]
-        out[j] = newer + older * (oldest - newer) + sensors.error[i, j]
+        older = past[(k - whole - 1) % size, j]
+        out[j] = newer + (age - whole) * (older - newer) + error[j]
+
+
+@compiled
+def _resolve(settings: Array, differenced: bool, k: int, last: Array, out: Array) -> None:
+    """The encoder's steps, and the velocity made of them."""
+    n = last.size // 2
     for j in range(n):
-        step = sensors.step[j]
+        step = settings[j]
         if step > 0.0:
             out[j] = math.floor(out[j] / step + 0.5) * step
-        if sensors.differenced:
+        if differenced:
             change = out[j] - last[j] if k > 0 else 0.0
-            out[n + j] = sensors.velocity[0] * last[n + j] + sensors.velocity[1] * change
+            out[n + j] = settings[n] * last[n + j] + settings[n + 1] * change
     copy(out, last)

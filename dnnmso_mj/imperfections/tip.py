@@ -6,48 +6,43 @@ import mujoco
 import numpy as np
 
 from dnnmso_mj.errors import ScenarioError
-from dnnmso_mj.scenario import Plant as PlantSpec
+from dnnmso_mj.plant import TIP
 
 Array = np.ndarray
 
-SITE = "tip"
 SLACK = 1e-9
 
 
 class Tip:
-    """The tip of a live model's last link: the site named tip, or the far end of link n.
+    """The site named tip of a live model; where links have lengths, the end of the last one.
 
     Args:
         model: changed by `carry`.
-        plant: of the scenario, for the links' lengths.
+        name: of the model, for messages.
 
     Attributes:
-        body: that it is on.
-        place: of the tip in that body's frame (3,) m.
+        site: MuJoCo's number of it.
 
     Raises:
-        ScenarioError: the model has neither.
+        ScenarioError: the model has no such site.
     """
 
-    def __init__(self, model: mujoco.MjModel, plant: PlantSpec) -> None:
-        self._model, self._name = model, plant.model
-        site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, SITE)
-        if site >= 0:
-            self.body, self.place = int(model.site_bodyid[site]), model.site_pos[site].copy()
-        elif plant.lengths is not None:
-            self.body = model.body(f"link{len(plant.lengths)}").id
-            self.place = np.array([plant.lengths[-1], 0.0, 0.0])
-        else:
+    def __init__(self, model: mujoco.MjModel, name: str) -> None:
+        self._model = model
+        self.site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, TIP)
+        if self.site < 0:
             raise ScenarioError(
-                f"events: plant.model = {plant.model} does not say where its tip is; allowed: a "
-                f'<site name="{SITE}"> on its last link, or plant.masses and plant.lengths'
+                f"events: plant.model = {name} does not say where its tip is; allowed: a "
+                f'<site name="{TIP}"> on its last link, or plant.masses and plant.lengths'
             )
+        self._body = int(model.site_bodyid[self.site])
+        self._place = model.site_pos[self.site].copy()
         self._bare = {name: array.copy() for name, array in self._inertial().items()}
         self._frames = [array.copy() for array in self._frame_flags()]
 
     def _inertial(self) -> dict[str, Array]:
         """Live views of what MuJoCo knows of the body's inertia, in its own frame."""
-        model, body = self._model, slice(self.body, self.body + 1)
+        model, body = self._model, slice(self._body, self._body + 1)
         return {
             "mass": model.body_mass[body],
             "centre": model.body_ipos[body],
@@ -62,7 +57,7 @@ class Tip:
 
     def name(self) -> str:
         """Of the body that the tip is on."""
-        return str(self._model.body(self.body).name)
+        return str(self._model.body(self._body).name)
 
     def loaded(self, payload: float) -> dict[str, Array]:
         """The body's inertial parameters with a point mass (kg) at the tip, by Steiner's theorem.
@@ -74,13 +69,13 @@ class Tip:
         mass = float(bare["mass"]) + payload
         if mass <= 0.0:
             raise self._refuse(f"leaves {mass:.4g} kg; allowed: above -{bare['mass']:.6g} kg")
-        centre = (bare["mass"] * bare["centre"] + payload * self.place) / mass
+        centre = (bare["mass"] * bare["centre"] + payload * self._place) / mass
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, bare["axes"])
         R = rotation.reshape(3, 3)
         inertia = R @ np.diag(bare["moments"]) @ R.T
         inertia += bare["mass"] * _steiner(bare["centre"] - centre)
-        inertia += payload * _steiner(self.place - centre)
+        inertia += payload * _steiner(self._place - centre)
         moments, axes = np.linalg.eigh(inertia)
         if moments[0] < -SLACK * moments[-1]:
             raise self._refuse("leaves a negative moment of inertia; allowed: a lighter one")
@@ -102,7 +97,7 @@ class Tip:
         for flags, bare in zip(self._frame_flags(), self._frames, strict=True):
             flags[:] = bare
         if payload:
-            _forget_inertial_frame(model, self.body)
+            _forget_inertial_frame(model, self._body)
         mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
