@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
 
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.imperfections.tip import Tip
+from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf, Plant
 from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
@@ -51,7 +54,8 @@ def test_a_payload_on_a_rod_follows_steiners_theorem(make_scenario, two_link):
         body.inertia = [1e-14, *[mass * length**2 / 12] * 2]
     spec.body("link2").pos = [0.7, 0, 0]
     weight = spec.body("link2").add_body(name="weight", pos=[0.4, 0, 0])
-    weight.mass, weight.inertia, weight.explicitinertial = 1.5, [1e-14] * 3, 1
+    weight.mass, weight.ipos, weight.inertia = 1.5, [0, 0, 0], [1e-14] * 3
+    weight.explicitinertial = 1
     Tip(plant.model, "two_link").carry(1.5)
     assert_alike(plant.model, spec.compile())
 
@@ -67,10 +71,11 @@ def test_a_payload_off_the_axis_turns_the_inertia(make_scenario):
     weight = """<body pos=".4 .1 -.2">
       <inertial pos="0 0 0" mass=".7" diaginertia="1e-14 1e-14 1e-14"/></body>"""
     plant = Plant(make_scenario(plant={"model": "own"}), Mjcf(text.format("")))
-    Tip(plant.model, "own").carry(0.7)
+    tip = Tip(plant.model, "own")
+    tip.carry(0.7)
     assert_alike(plant.model, mujoco.MjModel.from_xml_string(text.format(weight)))
     before = Plant(make_scenario(plant={"model": "own"}), Mjcf(text.format("")))
-    Tip(plant.model, "own").carry(0.0)
+    tip.carry(0.0)
     assert np.array_equal(plant.model.body_inertia, before.model.body_inertia)
     assert np.array_equal(plant.model.dof_invweight0, before.model.dof_invweight0)
 
@@ -217,3 +222,41 @@ def test_an_own_model_without_a_tip_is_told_to_name_one(make_scenario):
     scenario = make_scenario(OFF, **parts, **event(kind="payload", at=1.0, mass=1.0))
     with pytest.raises(ScenarioError, match='<site name="tip">'):
         Simulation(scenario, Mjcf(text))
+
+
+@pytest.mark.parametrize(
+    ("override", "warned"),
+    [
+        ("imperfections.torque_limit=70", "78.48 N·m of the arm with 1.2 kg at its tip"),
+        ("imperfections.torque_limit=80", None),
+        ("imperfections.friction.coulomb=[1.0,120.0]", "joint 2 is held by 120 N·m"),
+        ("imperfections.friction.coulomb=[1.0,119.0]", None),
+    ],
+)
+def test_loads_beyond_the_torque_limit_are_warned_of(override, warned):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load_scenario("hard", [override])
+    assert [warned in str(warning.message) for warning in caught] == ([True] if warned else [])
+
+
+def test_the_shipped_scenarios_are_as_hard_as_they_say():
+    hard, late = load_scenario("hard"), load_scenario("hard_delay")
+    assert (hard.imperfections.position_noise, hard.imperfections.velocity_noise) == (
+        (1e-4,),
+        (1e-3,),
+    )
+    assert hard.imperfections.torque_limit == (120.0,)
+    assert [(e.kind, e.at, e.mass) for e in hard.events] == [("payload", 20.0, 1.2)]
+    assert late.imperfections.actuator_delay == 0.02
+    same = {"name", "description", "imperfections"}
+    assert hard.model_dump(exclude=same) == late.model_dump(exclude=same)
+
+
+@pytest.mark.parametrize(("name", "worst"), [("push", 1e-2), ("friction", 1e-2)])
+def test_the_papers_controller_survives_and_beats_no_network(name, worst):
+    on = compute_metrics(simulate(load_scenario(name)))
+    off = compute_metrics(simulate(load_scenario(name, ["controller.kind=no_network"])))
+    assert on["rmse_steady"] < worst
+    assert on["rmse_steady"] < 0.25 * off["rmse_steady"]
+    assert on["bound_violations"] == off["bound_violations"] == 0

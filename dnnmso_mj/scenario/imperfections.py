@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from dnnmso_mj.scenario.fields import (
+    CountEach,
     FiniteEach,
     NonNegativeEach,
     PositiveEach,
@@ -16,20 +17,6 @@ from dnnmso_mj.scenario.fields import (
 )
 
 Delay = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1, le=2**53)]
-
-
-def _counts(value: object) -> object:
-    if isinstance(value, int) and not isinstance(value, bool):
-        return (value,)
-    return tuple(value) if isinstance(value, list) else value
-
-
-CountEach = Annotated[
-    tuple[Count, ...],
-    Field(min_length=1),
-    BeforeValidator(_counts, json_schema_input_type=Count | list[Count]),
-]
 
 
 class Friction(Strict):
