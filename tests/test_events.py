@@ -60,24 +60,37 @@ def test_a_payload_on_a_rod_follows_steiners_theorem(make_scenario, two_link):
     assert_alike(plant.model, spec.compile())
 
 
-def test_a_payload_off_the_axis_turns_the_inertia(make_scenario):
+@pytest.mark.parametrize(
+    "inertial", ['pos=".2 .1 0" euler="20 0 10"', 'pos="0 0 0"', 'pos=".1 0 0"']
+)
+def test_a_payload_off_the_axis_turns_the_inertia(make_scenario, inertial):
     """An arm of its own, in three dimensions, whose tip is on no axis of its last link."""
-    text = """<mujoco><worldbody><body name="a"><joint name="j1" axis="0 0 1"/>
+    text = f"""<mujoco><worldbody><body name="a"><joint name="j1" axis="0 0 1"/>
       <inertial pos=".1 .2 .3" mass="2" diaginertia=".1 .2 .25"/>
       <body name="b" pos=".5 0 .1" euler="10 20 30"><joint name="j2" axis="0 1 0"/>
-      <inertial pos=".2 .1 0" euler="20 0 10" mass="1" diaginertia=".1 .1 .15"/>
-      <site name="tip" pos=".4 .1 -.2"/>{}</body></body></worldbody>
-      <actuator><motor joint="j1"/><motor joint="j2"/></actuator></mujoco>"""
+      <inertial {inertial} mass="1" diaginertia=".1 .1 .15"/>
+      <site name="tip" pos=".4 .1 -.2"/><site name="mark" pos=".1 0 0"/>{{}}</body></body>
+      </worldbody><actuator><motor joint="j1"/><motor joint="j2"/></actuator></mujoco>"""
     weight = """<body pos=".4 .1 -.2">
       <inertial pos="0 0 0" mass=".7" diaginertia="1e-14 1e-14 1e-14"/></body>"""
     plant = Plant(make_scenario(plant={"model": "own"}), Mjcf(text.format("")))
     tip = Tip(plant.model, "own")
     tip.carry(0.7)
-    assert_alike(plant.model, mujoco.MjModel.from_xml_string(text.format(weight)))
+    built = mujoco.MjModel.from_xml_string(text.format(weight))
+    assert_alike(plant.model, built)
+    assert np.allclose(*(places(model) for model in (plant.model, built)), rtol=0, atol=1e-12)
     before = Plant(make_scenario(plant={"model": "own"}), Mjcf(text.format("")))
     tip.carry(0.0)
-    assert np.array_equal(plant.model.body_inertia, before.model.body_inertia)
-    assert np.array_equal(plant.model.dof_invweight0, before.model.dof_invweight0)
+    for name in ("body_inertia", "body_ipos", "body_sameframe", "site_sameframe", "dof_invweight0"):
+        assert np.array_equal(getattr(plant.model, name), getattr(before.model, name)), name
+
+
+def places(model: mujoco.MjModel) -> np.ndarray:
+    """Where the sites of a model are in a bent pose."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = STATES[0, 0]
+    mujoco.mj_forward(model, data)
+    return data.site_xpos
 
 
 def test_a_payload_comes_at_its_time_and_a_run_begins_without_it(make_scenario, two_link):

@@ -10,7 +10,7 @@ import pytest
 from dnnmso_mj.imperfections.friction import friction_law
 from dnnmso_mj.imperfections.loads import build_loads, load, start_loads
 from dnnmso_mj.metrics import compute_metrics
-from dnnmso_mj.plant import Plant, integrate
+from dnnmso_mj.plant import Mjcf, Plant, integrate
 from dnnmso_mj.scenario import Friction
 from dnnmso_mj.simulate import simulate
 
@@ -81,6 +81,40 @@ def test_a_load_below_breakaway_is_held_and_one_above_is_not(make_scenario, two_
     assert np.abs(q).max() < 1e-12
     q, _ = arm.run([0.0, 0.0], [0.0, 0.0], 100, tau=(-2.0, 0.0))
     assert q[-1, 0] < -1e-3
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_friction_is_full_against_motion_or_less_at_rest(make_scenario, n):
+    """The law at the end of the period, for chains whose joints pull at one another."""
+    body = "".join(
+        f'<body name="link{k}" pos="{float(k > 1)} 0 0"><joint name="j{k}" axis="0 -1 0"/>'
+        '<inertial pos="1 0 0" mass="1" diaginertia="1e-3 1e-3 1e-3"/>'
+        for k in range(1, n + 1)
+    )
+    motors = "".join(f'<motor joint="j{k}"/>' for k in range(1, n + 1))
+    mjcf = Mjcf(f"<mujoco><worldbody>{body}{'</body>' * n}</worldbody>"
+                f"<actuator>{motors}</actuator></mujoco>")  # fmt: skip
+    rng, most = np.random.default_rng(n), 8.0
+    scenario = make_scenario(
+        plant={"masses": [0.5] * n, "lengths": [0.4] * n},
+        initial={"q": [0.0] * n},
+        reference={"kind": "sinusoid"},
+        imperfections={"friction": {"coulomb": most}},
+    )
+    plant = Plant(scenario, mjcf)
+    loads = build_loads(scenario, plant, None)
+    held = 0
+    for _ in range(50):
+        plant.reset(rng.uniform(-1, 1, n), rng.normal(0.0, 0.02, n))
+        start_loads(loads)
+        load(loads, plant.view, rng.normal(0.0, 10.0, n), DT)
+        v = plant.qd + DT * plant.view.qacc
+        free = np.abs(loads.torque) >= most
+        assert np.abs(loads.torque).max() <= most
+        assert np.abs(v[~free]).max(initial=0.0) < 1e-9
+        assert np.all(loads.torque[free] * v[free] <= 1e-9)
+        held += (~free).sum()
+    assert 0 < held < 50 * n
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dnnmso_mj.compiling import compiled, inner
-from dnnmso_mj.imperfections.friction import friction_law, rub
+from dnnmso_mj.imperfections.friction import HELD, N_PARTS, UNIT, friction_law, rub
 from dnnmso_mj.imperfections.tip import Tip
 from dnnmso_mj.mujoco_calls import mj_comPos, mj_jacSite, mj_kinematics
 from dnnmso_mj.plant import Plant, PlantView, forward
@@ -30,7 +30,7 @@ class Loads(NamedTuple):
     held: Array  # (2, n) N·m: all of it in the period before; the dry friction in it
     push: Array  # (n + 3,) from outside: N·m on the joints, N at the tip
     law: Array  # (3, n) of dry friction
-    scratch: Array  # (3, max(n, 3), n): the identity first
+    scratch: Array  # (N_PARTS, max(n, 3), n): see `friction.rub`
     site: int  # MuJoCo's, of the tip
     acting: bool  # whether anything may ever act
     dry: bool  # whether there is dry friction
@@ -46,8 +46,8 @@ def build_loads(scenario: Scenario, plant: Plant, tip: Tip | None) -> Loads:
     """
     n, friction = scenario.n_joints, scenario.imperfections.friction
     plant.damp(expand(friction.viscous, n))
-    scratch = np.zeros((3, max(n, 3), n))
-    scratch[0, :n] = np.eye(n)
+    scratch = np.zeros((N_PARTS, max(n, 3), n))
+    scratch[UNIT, :n] = np.eye(n)
     return Loads(
         torque=plant.applied,
         held=np.zeros((2, n)),
@@ -101,7 +101,7 @@ def _push(
         torque[j] = push[j]
     if push[n] == 0.0 and push[n + 1] == 0.0 and push[n + 2] == 0.0:
         return
-    jacobian = scratch[2]
+    jacobian = scratch[HELD]
     mj_kinematics(model, data)
     mj_comPos(model, data)
     mj_jacSite(model, data, jacobian.ctypes.data, 0, site)
