@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.imperfections.actuators import actuate, build_actuators, split
 from dnnmso_mj.scenario import Imperfections
 from dnnmso_mj.simulate import simulate
@@ -110,8 +111,6 @@ def test_the_log_and_the_controller_are_told_the_torque_that_acted(make_scenario
 
 
 def test_with_late_torques_the_true_dynamics_are_still_those_of_the_arm(make_scenario):
-    from dnnmso_mj.dynamics import TwoLink
-
     spec = {"actuator_delay": 0.0015, "actuator_lag": 0.002, "position_noise": 1e-3}
     trace = simulate(make_scenario({"kind": "no_network"}, duration=0.3, imperfections=spec))
     q, qd = trace["q"], trace["qd"]

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.imperfections.tip import Tip
 from dnnmso_mj.loading import load_scenario
@@ -173,8 +174,6 @@ def test_the_impulse_of_a_push_is_torque_times_time(make_scenario):
     trace = simulate(
         make_scenario(free, duration=0.02, reference=still, plant={"gravity": 0.0}, events=events)
     )
-    from dnnmso_mj.dynamics import TwoLink
-
     M = TwoLink((1.0, 2.3), (1.0, 1.0)).inertia(trace["q"][-1])
     assert np.allclose(M @ trace["qd"][-1], [0.0, 0.04], rtol=1e-2, atol=1e-4)
 
@@ -190,6 +189,30 @@ def test_the_impulse_of_a_push_is_torque_times_time(make_scenario):
 def test_the_bound_of_the_closed_loop_holds_through_events(make_scenario, kind, events):
     trace = simulate(make_scenario({"kind": kind}, duration=3.0, events=events))
     assert compute_metrics(trace)["bound_violations"] == 0
+
+
+def test_the_bound_counts_a_push_as_what_was_held_through_the_step(make_scenario):
+    """The comparison equations of `theory`, integrated anew from the log and the push."""
+    torque = np.array([200.0, -100.0])
+    push = {"kind": "push", "at": 0.02, "duration": 0.01, "torque": torque.tolist()}
+    trace = simulate(make_scenario(OFF, duration=0.05, events=[push]))
+    gain = lam = 7.5
+    arm = TwoLink((1.0, 2.3), (1.0, 1.0))
+    e, ed = trace["q"] - trace["q_ref"], trace["qd"] - trace["qd_ref"]
+    qdd_ref = [[-0.25 * np.sin(0.5 * t), -0.25 * np.cos(0.5 * t)] for t in trace["t"]]
+
+    def d(k: int, held: int) -> float:
+        """‖d‖ at tick k under what is held through the step that begins at tick `held`."""
+        tau = trace["tau"][held] + torque * (20 <= held < 30)
+        edd = arm.acceleration(trace["q"][k], trace["qd"][k], tau) - qdd_ref[k]
+        return float(np.linalg.norm(edd + (gain + lam) * ed[k] + gain * lam * e[k]))
+
+    decay, weight = np.exp(-7.5e-3), -np.expm1(-7.5e-3) / 7.5
+    s, joint = np.linalg.norm(ed[0] + lam * e[0]), np.linalg.norm(e[0])
+    for k in range(len(trace) - 1):
+        before, s = s, decay * s + weight * 0.5 * (d(k, k) + d(k + 1, k))
+        joint = decay * joint + weight * max(s, before)
+        assert trace["ultimate_bound"][k + 1] == pytest.approx(joint, rel=1e-9), k
 
 
 def event(**parts) -> dict:

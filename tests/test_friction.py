@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.imperfections.friction import friction_law
 from dnnmso_mj.imperfections.loads import build_loads, load, start_loads
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf, Plant, integrate
 from dnnmso_mj.scenario import Friction
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulate import Simulation, simulate
 
 DT = 1e-3
 INTEGRATORS = ["rk4", "euler", "implicitfast"]
@@ -39,8 +40,6 @@ class Coasting:
 
     def energy(self, q, qd) -> float:
         """Kinetic energy (J)."""
-        from dnnmso_mj.dynamics import TwoLink
-
         M = TwoLink((1.0, 2.3), (1.0, 1.0)).inertia(q)
         return 0.5 * np.einsum("ki,kij,kj->k", qd, M, qd)
 
@@ -153,8 +152,6 @@ def test_viscous_friction_slows_as_an_exponential(make_scenario, two_link):
 
 
 def test_friction_is_the_plants_alone(make_scenario, two_link):
-    from dnnmso_mj.simulate import Simulation
-
     scenario = make_scenario(imperfections={"friction": {"viscous": 3.0}})
     simulation = Simulation(scenario, two_link)
     assert simulation.plant.model.dof_damping.tolist() == [3.0, 3.0]
@@ -164,8 +161,6 @@ def test_friction_is_the_plants_alone(make_scenario, two_link):
 
 @pytest.mark.parametrize("friction", [{"viscous": 2.0}, {"coulomb": 3.0, "breakaway": 5.0}])
 def test_the_true_dynamics_hold_the_friction(make_scenario, friction):
-    from dnnmso_mj.dynamics import TwoLink
-
     scenario = make_scenario(
         {"kind": "no_network"}, duration=1.0, imperfections={"friction": friction}
     )

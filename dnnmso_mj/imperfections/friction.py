@@ -23,7 +23,7 @@ import math
 
 import numpy as np
 
-from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.compiling import compiled, copy
 from dnnmso_mj.inversion import solve_spd
 from dnnmso_mj.mujoco_calls import mj_solveM
 from dnnmso_mj.scenario import Friction, expand
@@ -36,7 +36,7 @@ COULOMB, EXTRA, STRIBECK = range(3)
 # Parts of the scratch memory; MASS_INV takes M⁻¹, HELD its rows and columns of held joints.
 UNIT, MASS_INV, HELD, FACTOR, VECTORS = range(5)
 N_PARTS = 5
-V_FREE, SOLVED, RIGHT = range(3)  # rows of VECTORS
+V_FREE, MOST, SOLVED, RIGHT = range(4)  # rows of VECTORS
 
 SWEEPS = 200  # few do
 
@@ -60,56 +60,51 @@ def rub(
         qd: q̇ (n,) rad/s.
         qdd: q̈ (n,) rad/s² without friction.
         law: see `friction_law`.
-        scratch: (N_PARTS, at least 3 and n, n), the identity in UNIT.
+        scratch: (N_PARTS, at least 4 and n, n), the identity in UNIT.
         tau: in and out.
     """
-    n, v_free = qd.size, scratch[VECTORS, V_FREE]
+    n, v_free, most = qd.size, scratch[VECTORS, V_FREE], scratch[VECTORS, MOST]
     mj_solveM(model, data, scratch[MASS_INV].ctypes.data, scratch[UNIT].ctypes.data, n)
     for i in range(n):
         v_free[i] = (qd[i] + dt * qdd[i]) / dt
+        most[i] = law[COULOMB, i] + law[EXTRA, i] * math.exp(-((qd[i] / law[STRIBECK, i]) ** 2))
     for _ in range(SWEEPS):
         for i in range(n):
-            most = _most(law, i, qd[i])
             stopping = tau[i] - _velocity(scratch, tau, i) / scratch[MASS_INV, i, i]
-            tau[i] = min(max(stopping, -most), most)
-        if _hold(law, qd, scratch, tau):
+            tau[i] = min(max(stopping, -most[i]), most[i])
+        if _hold(scratch, tau):
             break
 
 
-@inner
-def _most(law: Array, i: int, qd: float) -> float:
-    """F (N·m) of joint i at q̇ (rad/s)."""
-    return law[COULOMB, i] + law[EXTRA, i] * math.exp(-((qd / law[STRIBECK, i]) ** 2))
-
-
-@inner
+@compiled
 def _velocity(scratch: Array, tau: Array, i: int) -> float:
     """v_i/dt (rad/s²) at the end of the period under friction τ (n,) N·m."""
     v = scratch[VECTORS, V_FREE, i]
     for j in range(tau.size):
         v += scratch[MASS_INV, i, j] * tau[j]
-    return v
+    return float(v)
 
 
 @compiled
-def _hold(law: Array, qd: Array, scratch: Array, tau: Array) -> bool:
+def _hold(scratch: Array, tau: Array) -> bool:
     """Stop at once all joints that τ (n,) holds with less than F; False if that is not the law."""
-    n, solved, right = qd.size, scratch[VECTORS, SOLVED], scratch[VECTORS, RIGHT]
+    n, most = tau.size, scratch[VECTORS, MOST]
+    solved, right = scratch[VECTORS, SOLVED], scratch[VECTORS, RIGHT]
     for i in range(n):
-        held = abs(tau[i]) < _most(law, i, qd[i])
+        held = abs(tau[i]) < most[i]
         right[i] = -scratch[VECTORS, V_FREE, i] if held else tau[i]
         for j in range(n):
-            other = abs(tau[j]) < _most(law, j, qd[j])
-            if held and not other:
+            scratch[HELD, i, j] = scratch[UNIT, i, j]
+            if held and abs(tau[j]) < most[j]:
+                scratch[HELD, i, j] = scratch[MASS_INV, i, j]
+            elif held:
                 right[i] -= scratch[MASS_INV, i, j] * tau[j]
-            both = held and other
-            scratch[HELD, i, j] = scratch[MASS_INV, i, j] if both else scratch[UNIT, i, j]
     solve_spd(scratch[HELD], right, solved, scratch[FACTOR])
     for i in range(n):
-        if abs(tau[i]) < _most(law, i, qd[i]):
-            if abs(solved[i]) > _most(law, i, qd[i]):
-                return False
-        elif tau[i] * _velocity(scratch, solved, i) > 0.0:
+        held = abs(tau[i]) < most[i]
+        if held and abs(solved[i]) > most[i]:
+            return False
+        if not held and tau[i] * _velocity(scratch, solved, i) > 0.0:
             return False
     copy(solved, tau)
     return True

@@ -30,7 +30,7 @@ class Loads(NamedTuple):
     held: Array  # (2, n) N·m: all of it in the period before; the dry friction in it
     push: Array  # (n + 3,) from outside: N·m on the joints, N at the tip
     law: Array  # (3, n) of dry friction
-    scratch: Array  # (N_PARTS, max(n, 3), n): see `friction.rub`
+    scratch: Array  # (N_PARTS, max(n, 4), n): see `friction.rub`
     site: int  # MuJoCo's, of the tip
     acting: bool  # whether anything may ever act
     dry: bool  # whether there is dry friction
@@ -46,7 +46,7 @@ def build_loads(scenario: Scenario, plant: Plant, tip: Tip | None) -> Loads:
     """
     n, friction = scenario.n_joints, scenario.imperfections.friction
     plant.damp(expand(friction.viscous, n))
-    scratch = np.zeros((N_PARTS, max(n, 3), n))
+    scratch = np.zeros((N_PARTS, max(n, 4), n))
     scratch[UNIT, :n] = np.eye(n)
     return Loads(
         torque=plant.applied,
