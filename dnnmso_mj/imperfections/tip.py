@@ -38,7 +38,6 @@ class Tip:
         self._body = int(model.site_bodyid[self.site])
         self._place = model.site_pos[self.site].copy()
         self._bare = {name: array.copy() for name, array in self._inertial().items()}
-        self._frames = [array.copy() for array in self._frame_flags()]
 
     def _inertial(self) -> dict[str, Array]:
         """Live views of what MuJoCo knows of the body's inertia, in its own frame."""
@@ -49,11 +48,6 @@ class Tip:
             "moments": model.body_inertia[body],
             "axes": model.body_iquat[body],
         }
-
-    def _frame_flags(self) -> list[Array]:
-        """Where MuJoCo keeps which frames coincide, to compute them once."""
-        model = self._model
-        return [model.body_sameframe, model.geom_sameframe, model.site_sameframe]
 
     def name(self) -> str:
         """Of the body that the tip is on."""
@@ -94,10 +88,7 @@ class Tip:
         values = self.loaded(payload) if payload else self._bare
         for name, view in self._inertial().items():
             view[:] = values[name]
-        for flags, bare in zip(self._frame_flags(), self._frames, strict=True):
-            flags[:] = bare
-        if payload:
-            _forget_inertial_frame(model, self._body)
+        # This also finds anew which frames coincide.
         mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
@@ -105,13 +96,3 @@ def _steiner(arm: Array) -> Array:
     """Inertia of a unit point mass about the centre at distance `arm` (3,) m: (3, 3) m²."""
     inertia: Array = arm @ arm * np.eye(3) - np.outer(arm, arm)
     return inertia
-
-
-def _forget_inertial_frame(model: mujoco.MjModel, body: int) -> None:
-    """The body's inertial frame has moved: nothing coincides with it any more."""
-    model.body_sameframe[body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-    for parts, bodies in (
-        (model.geom_sameframe, model.geom_bodyid),
-        (model.site_sameframe, model.site_bodyid),
-    ):
-        parts[bodies == body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
