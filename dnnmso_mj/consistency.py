@@ -115,6 +115,9 @@ def _controller_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, 
                 yield f"{path}.effectiveness.{name}", len(values), {n}
     if hasattr(controller, "observer"):
         yield "controller.observer.K2", len(controller.observer.K2), {1, 2 * n}
+    for name, value in controller:
+        if isinstance(value, tuple):
+            yield f"controller.{name}", len(value), {1, n}
 
 
 def _reference_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:

@@ -14,17 +14,15 @@ from pydantic import BeforeValidator, Field, model_validator
 from dnnmso_mj.consistency import contradictions, entries
 from dnnmso_mj.scenario.controller import (
     ClassicalMso,
-    Constant,
     Controller,
     DnnMso,
-    Effectiveness,
-    Inertia,
     Inversion,
     Madam,
     Network,
     NoNetwork,
     Observer,
 )
+from dnnmso_mj.scenario.effectiveness import Constant, Effectiveness, Inertia
 from dnnmso_mj.scenario.events import Event, Freeze
 from dnnmso_mj.scenario.fields import (
     FiniteEach,
@@ -38,10 +36,14 @@ from dnnmso_mj.scenario.fields import (
     expand,
     refusal,
 )
+from dnnmso_mj.scenario.rivals import L1, Adrc, ComputedTorque, Pd, Pid, Rise, SlidingMode
 
 __all__ = [
+    "L1",
     "PAPER_MODEL",
+    "Adrc",
     "ClassicalMso",
+    "ComputedTorque",
     "Constant",
     "Controller",
     "DnnMso",
@@ -56,12 +58,16 @@ __all__ = [
     "Network",
     "NoNetwork",
     "Observer",
+    "Pd",
+    "Pid",
     "Plant",
     "RealTime",
     "Reference",
+    "Rise",
     "Scenario",
     "Setpoint",
     "Sinusoid",
+    "SlidingMode",
     "Stall",
     "Waypoints",
     "expand",
