@@ -8,9 +8,10 @@ The plant is q̈ = B₂ τ + σ(t), σ lumping all that is unknown; the law has 
     filter       u' = −ω_f (u + σ̂)
 
 The adaptation is as fast as sampling allows: one period later ṽ = −Φ σ̄, with σ̄ the mean of σ over
-that period, so |ṽ| ≤ dt max|σ| whatever the plant does. The filter alone decides what is
-compensated: u → −σ within 1/ω_f. The predictor is integrated over a period in closed form, q̈ being
-taken for constant in it; all is in acceleration, the matched channel of a robot with inertia B₂⁻¹.
+that period, so |ṽ| ≤ dt max|σ| whatever the plant does, and σ̂ = exp(−a dt) σ̄. The filter decides
+what is compensated: u follows −σ̂ within 1/ω_f, and a share a dt of a constant σ is left. The
+predictor is integrated over a period in closed form, q̈ being taken for constant in it; all is in
+acceleration, the matched channel of a robot with inertia B₂⁻¹.
 
 Hovakimyan and Cao, "L1 Adaptive Control Theory: Guaranteed Robustness with Fast Adaptation", SIAM,
 2010, section 3.3. Xargay, Hovakimyan and Cao, "L1 adaptive controller for multi-input multi-output

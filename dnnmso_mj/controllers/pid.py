@@ -5,7 +5,8 @@
 
 T_t is the geometric mean of the integral time K_p/K_i and the derivative time K_d/K_p. While the
 drive gives what was asked the second term is zero; at a limit z follows what is given, and does not
-wind up. The drive tells one period late, so that a period's shortfall enters at the next tick.
+wind up. The drive tells one period late, so that a period's shortfall enters at the next tick. What
+a drive with lag or delay owes for a while counts as a shortfall too, and is paid back as it comes.
 
 Back-calculation and T_t: Åström and Hägglund, "PID Controllers: Theory, Design, and Tuning", ISA,
 1995, section 3.5. PID of robots: Arimoto and Miyazaki, "Stability and robustness of PID feedback
@@ -14,7 +15,6 @@ control for robot manipulators of sensory capability", Int. Symp. Robotics Resea
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -35,6 +35,7 @@ class Parts(NamedTuple):
     kp: Array  # (n,) N·m/rad
     ki: Array  # (n,) N·m/(rad·s)
     kd: Array  # (n,) N·m·s/rad
+    unwind: Array  # 1/T_t (n,) 1/s
     z: Array  # (n,) N·m, the integral
     asked: Array  # (n,) N·m, commanded in the last tick
     command: Command
@@ -54,10 +55,12 @@ class PidController:
 
     def __init__(self, spec: Pid, n_joints: int, dt: float) -> None:
         n = n_joints
+        ki, kd = expand(spec.ki, n), expand(spec.kd, n)
         self._parts = Parts(
             kp=expand(spec.kp, n),
-            ki=expand(spec.ki, n),
-            kd=expand(spec.kd, n),
+            ki=ki,
+            kd=kd,
+            unwind=np.sqrt(ki / kd),
             z=np.zeros(n),
             asked=np.zeros(n),
             command=empty_command(n),
@@ -94,8 +97,7 @@ def update(parts: Parts, inputs: Inputs) -> None:
     for i in range(n):
         e, ed = x[i] - x_ref[i], x[n + i] - x_ref[n + i]
         if adapting:
-            rate = math.sqrt(parts.ki[i] / parts.kd[i])
-            parts.z[i] += dt * rate * (inputs.tau[i] - parts.asked[i])
+            parts.z[i] += dt * parts.unwind[i] * (inputs.tau[i] - parts.asked[i])
         tau[i] = -parts.kp[i] * e - parts.kd[i] * ed + parts.z[i]
         if adapting:
             parts.z[i] -= dt * parts.ki[i] * e

@@ -103,8 +103,8 @@ class L1(Strict):
     """Position gain (1/s²), each; ω² for a double pole at -ω = -7.5 1/s."""
     kd: PositiveEach = (15.0,)
     """Velocity gain (1/s), each; 2 ω."""
-    predictor_gain: PositiveEach = (10.0,)
-    """a (1/s), each: the predictor's error decays at this rate."""
+    predictor_gain: PositiveEach = (1.0,)
+    """a (1/s), each: decay of the predictor's error; the share a dt of σ is not compensated."""
     filter_bandwidth: PositiveEach = (75.0,)
     """ω_f (1/s), each: what is slower is compensated, the rest is left to feedback."""
     effectiveness: Effectiveness = Inertia(kind="inertia")
