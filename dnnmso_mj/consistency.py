@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from dnnmso_mj.scenario.controller import effectiveness, inversion
+from dnnmso_mj.scenario.rivals import Rival
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -130,6 +131,10 @@ def _controller_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, 
                 yield f"{path}.effectiveness.{name}", len(values), {n}
     if hasattr(controller, "observer"):
         yield "controller.observer.K2", len(controller.observer.K2), {1, 2 * n}
+    if isinstance(controller, Rival):  # each of its gains is of a joint
+        for name, value in controller:
+            if isinstance(value, tuple):
+                yield f"controller.{name}", len(value), {1, n}
 
 
 def _reference_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:

@@ -35,7 +35,7 @@ from dnnmso_mj.mujoco_calls import (
 )
 from dnnmso_mj.scenario import Inertia, Scenario
 from dnnmso_mj.scenario import Plant as PlantSpec
-from dnnmso_mj.scenario.controller import effectiveness
+from dnnmso_mj.scenario.controller import effectiveness, inversion
 from dnnmso_mj.unmodelled import refuse_unmodelled
 
 Array = np.ndarray
@@ -166,13 +166,12 @@ def _plant_model(plant: PlantSpec, dt: float, mjcf: Mjcf) -> mujoco.MjModel:
 
 @lru_cache(maxsize=16)
 def _nominal_model(
-    plant: PlantSpec, known: Inertia | None, dt: float, mjcf: Mjcf
+    plant: PlantSpec, known: Inertia | None, part: str, dt: float, mjcf: Mjcf
 ) -> mujoco.MjModel:
-    """The plant, with the masses and lengths that the controller believes."""
+    """The plant, with the masses and lengths that the controller believes at key path `part`."""
     spec = build_spec(plant, dt, mjcf)
     masses = (known and known.masses) or plant.masses
     lengths = (known and known.lengths) or plant.lengths
-    part = "controller.inversion.effectiveness"
     if (masses is None) != (lengths is None):
         raise ScenarioError(
             f"{part}: masses or lengths alone; allowed: both, or none, where plant.masses and "
@@ -308,7 +307,9 @@ class NominalModel:
     def __init__(self, scenario: Scenario, mjcf: Mjcf) -> None:
         believed = effectiveness(scenario.controller)
         known = believed if isinstance(believed, Inertia) else None
-        self.model = deepcopy(_nominal_model(scenario.plant, known, scenario.dt, mjcf))
+        inverts = inversion(scenario.controller) is not None
+        part = f"controller.{'inversion.' if inverts else ''}effectiveness"
+        self.model = deepcopy(_nominal_model(scenario.plant, known, part, scenario.dt, mjcf))
         data = self._data = mujoco.MjData(self.model)
         self.view = Nominal(
             model=self.model._address,

@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -18,12 +19,14 @@ from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading import ScenarioWarning, load_scenario
 from dnnmso_mj.loading.advice import stretched_load
 from dnnmso_mj.paths import models_dir, scenarios_dir
-from dnnmso_mj.scenario import DnnMso, NoNetwork, Plant, Scenario, Setpoint, Sinusoid
+from dnnmso_mj.scenario import Controller, DnnMso, NoNetwork, Plant, Scenario, Setpoint, Sinusoid
 from dnnmso_mj.simulate import simulate
 
 MINIMAL = "name: x\nreference:\n  kind: sinusoid\ncontroller:\n  kind: dnn_mso\n"  # lines 1 to 5
 PAPER = (scenarios_dir() / "paper.yaml").read_text()
 TOP = ", ".join(Scenario.model_fields)
+SPECS = get_args(get_args(Controller)[0])
+KINDS = ", ".join(sorted(get_args(spec.model_fields["kind"].annotation)[0] for spec in SPECS))
 
 Load = Callable[..., Scenario]
 Refusal = Callable[..., str]
@@ -209,7 +212,7 @@ REFUSED = {
     ),
     "no kind": (
         "",
-        "4: controller.kind: missing key; allowed: one of: classical_mso, dnn_mso, no_network",
+        f"4: controller.kind: missing key; allowed: one of: {KINDS}",
     ),
     "kind of a wrong type": ("", "3: reference.kind = [1]: is a list; allowed: one of: setpoint, "),
     "kind of the inner union": (
@@ -467,7 +470,7 @@ REFUSED_OVERRIDES = {
     "plant={gravity: -1}": "plant.gravity = -1: is out of range; allowed: a number >= 0",
     "plant.model=mine.xml": 'plant.model = "mine.xml": no model "mine.xml" in ',
     "controller.kind=nonetwork": 'controller.kind = "nonetwork": is none of the choices; allowed: '
-    "one of: classical_mso, dnn_mso, no_network; did you mean 'no_network'?",
+    f"one of: {KINDS}; did you mean 'no_network'?",
     "duration=1.0005": "duration = 1.0005: is 1000.5 steps of dt = 0.001; allowed: ",
 }
 

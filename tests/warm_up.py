@@ -12,6 +12,8 @@ from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Madam, Network
 from dnnmso_mj.simulate import Simulation, simulate
 
+RIVALS = ("pd", "pid", "computed_torque", "adrc", "sliding_mode", "rise", "l1")
+
 
 def main() -> None:
     """Every loop that ships, every `update` on its own, and learners in both precisions."""
@@ -22,6 +24,7 @@ def main() -> None:
         ("paper_no_network", []),
         ("classical_mso", []),
         ("classical_mso", [double]),
+        *(("paper", [f"controller={{kind: {kind}}}"]) for kind in RIVALS),
     ):
         scenario = load_scenario(name, [*sets, "duration=0.01"])
         simulate(scenario)

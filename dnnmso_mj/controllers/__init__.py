@@ -11,6 +11,7 @@ from dnnmso_mj.inversion import DynamicInversion
 from dnnmso_mj.monitors import Monitors
 from dnnmso_mj.plant import Mjcf, NominalModel
 from dnnmso_mj.scenario import ClassicalMso, DnnMso, DnnMsoReplay, NoNetwork, Scenario
+from dnnmso_mj.scenario.rivals import Rival
 
 if TYPE_CHECKING:
     from dnnmso_mj.tick import Loop
@@ -121,9 +122,12 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
     from dnnmso_mj.controllers.dnn_mso import DnnMsoController
     from dnnmso_mj.controllers.dnn_mso_replay import DnnMsoReplayController
     from dnnmso_mj.controllers.no_network import NoNetworkController
+    from dnnmso_mj.controllers.rivals import build_rival
 
     nominal = NominalModel(scenario, mjcf)
     spec, n, dt = scenario.controller, scenario.n_joints, scenario.dt
+    if isinstance(spec, Rival):
+        return build_rival(spec, n, dt, nominal)
     match spec:
         case DnnMso():
             return DnnMsoController(spec, n, dt, scenario.seed, nominal, watch=watch)

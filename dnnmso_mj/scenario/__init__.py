@@ -14,12 +14,9 @@ from pydantic import BeforeValidator, Field, model_validator
 from dnnmso_mj.consistency import contradictions, entries
 from dnnmso_mj.scenario.controller import (
     ClassicalMso,
-    Constant,
     Controller,
     DnnMso,
     DnnMsoReplay,
-    Effectiveness,
-    Inertia,
     Inversion,
     KnownDelay,
     Madam,
@@ -27,6 +24,7 @@ from dnnmso_mj.scenario.controller import (
     NoNetwork,
     Observer,
 )
+from dnnmso_mj.scenario.effectiveness import Constant, Effectiveness, Inertia
 from dnnmso_mj.scenario.events import Event, Freeze, Payload, Push
 from dnnmso_mj.scenario.fields import (
     FiniteEach,
@@ -40,10 +38,14 @@ from dnnmso_mj.scenario.fields import (
     refusal,
 )
 from dnnmso_mj.scenario.imperfections import Friction, Imperfections
+from dnnmso_mj.scenario.rivals import L1, Adrc, ComputedTorque, Pd, Pid, Rise, SlidingMode
 
 __all__ = [
+    "L1",
     "PAPER_MODEL",
+    "Adrc",
     "ClassicalMso",
+    "ComputedTorque",
     "Constant",
     "Controller",
     "DnnMso",
@@ -62,13 +64,17 @@ __all__ = [
     "NoNetwork",
     "Observer",
     "Payload",
+    "Pd",
+    "Pid",
     "Plant",
     "Push",
     "RealTime",
     "Reference",
+    "Rise",
     "Scenario",
     "Setpoint",
     "Sinusoid",
+    "SlidingMode",
     "Stall",
     "Waypoints",
     "expand",

@@ -7,17 +7,18 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from dnnmso_mj.scenario.effectiveness import Constant, Effectiveness, Inertia
 from dnnmso_mj.scenario.fields import (
     Matrix,
     NonNegative,
     Positive,
     PositiveEach,
-    Positives,
     Strict,
     WeightScale,
     as_tuple,
     refusal,
 )
+from dnnmso_mj.scenario.rivals import Rival
 
 MAX_WEIGHTS = 10_000_000
 
@@ -101,29 +102,6 @@ class Observer(Strict):
     """stable: +K₂(X - X̂). as_printed: the paper's sign, which diverges."""
     torque: Literal["commanded", "applied"] = "commanded"
     """The torque that it takes for u: its own command (paper), or what the drives say acted."""
-
-
-class Inertia(Strict):
-    """B₂ = M(q)⁻¹ of the controller's nominal model."""
-
-    kind: Literal["inertia"]
-    """B from a nominal model."""
-    masses: Positives | None = None
-    """Masses that the controller believes (kg); null: the plant's."""
-    lengths: Positives | None = None
-    """Lengths that the controller believes (m); null: the plant's."""
-
-
-class Constant(Strict):
-    """B₂ = b·I: no model at all."""
-
-    kind: Literal["constant"]
-    """B without a model."""
-    b: Positive = 1.0
-    """Control effectiveness (1/(kg·m²))."""
-
-
-Effectiveness = Annotated[Inertia | Constant, Field(discriminator="kind")]
 
 
 class Inversion(Strict):
@@ -287,7 +265,7 @@ class DnnMsoReplay(Strict):
 
 
 Controller = Annotated[
-    DnnMso | NoNetwork | ClassicalMso | DnnMsoReplay, Field(discriminator="kind")
+    DnnMso | NoNetwork | ClassicalMso | DnnMsoReplay | Rival, Field(discriminator="kind")
 ]
 
 
