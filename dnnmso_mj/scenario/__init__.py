@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from dnnmso_mj.consistency import contradictions, entries
+from dnnmso_mj.scenario.adaptive import ConcurrentLearning, SlotineLi
 from dnnmso_mj.scenario.controller import (
     ClassicalMso,
     Constant,
@@ -42,6 +43,7 @@ from dnnmso_mj.scenario.fields import (
 __all__ = [
     "PAPER_MODEL",
     "ClassicalMso",
+    "ConcurrentLearning",
     "Constant",
     "Controller",
     "DnnMso",
@@ -62,6 +64,7 @@ __all__ = [
     "Scenario",
     "Setpoint",
     "Sinusoid",
+    "SlotineLi",
     "Stall",
     "Waypoints",
     "expand",

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from dnnmso_mj.scenario.adaptive import ConcurrentLearning, SlotineLi
 from dnnmso_mj.scenario.fields import (
     Matrix,
     NonNegative,
@@ -212,7 +213,10 @@ class ClassicalMso(Strict):
         return self
 
 
-Controller = Annotated[DnnMso | NoNetwork | ClassicalMso, Field(discriminator="kind")]
+Controller = Annotated[
+    DnnMso | NoNetwork | ClassicalMso | SlotineLi | ConcurrentLearning,
+    Field(discriminator="kind"),
+]
 
 
 def inversion(controller: Controller) -> Inversion | None:
