@@ -4,7 +4,7 @@
 
 While S is singular the newest pair takes the place of the oldest. From then on a pair is taken only
 where it raises λ_min(S), in the place where it raises it most, so that what a short excitation told
-is never lost again.
+is never lost again; unless pairs are given an age at which they make way whatever comes.
 
 φ̂ is advanced by the implicit Euler step (I + dt k S) φ̂⁺ = φ̂ + dt k b, stable for every k and S.
 
@@ -28,8 +28,7 @@ Array = np.ndarray
 SINGULAR_BELOW = 1e-12
 BISECTIONS = 40
 
-# Slots of `HistoryStack.counts`.
-FILLED, OLDEST = range(2)
+EMPTY = 2**62  # the age of a place without a pair: older than any
 
 
 class HistoryStack(NamedTuple):
@@ -42,14 +41,21 @@ class HistoryStack(NamedTuple):
     step: Array  # (p, p) lower Cholesky factor of I + dt k S
     trial: Array  # (p, p) scratch
     L: Array  # (p, p) scratch
-    counts: Array  # int64, see above
+    age: Array  # (N,) int64, offers since the pair was taken
     quality: Array  # (1,) λ_min(S), zero where S is singular
     gain: float  # dt k
+    oldest: int  # the age from which a pair makes way
 
 
-def build_stack(size: int, equations: int, parameters: int, gain: float) -> HistoryStack:
-    """An empty stack of `size` pairs; `gain` is dt k, period times learning gain."""
-    p = parameters
+def build_stack(shape: tuple[int, int, int], gain: float, oldest: int = EMPTY) -> HistoryStack:
+    """An empty stack.
+
+    Args:
+        shape: pairs, equations a pair, parameters.
+        gain: dt k, the period times the learning gain.
+        oldest: the age in offers from which a pair makes way for any other.
+    """
+    size, equations, p = shape
     return HistoryStack(
         Y=np.zeros((size, equations, p)),
         U=np.zeros((size, equations)),
@@ -58,27 +64,30 @@ def build_stack(size: int, equations: int, parameters: int, gain: float) -> Hist
         step=np.eye(p),
         trial=np.zeros((p, p)),
         L=np.zeros((p, p)),
-        counts=np.zeros(2, np.int64),
+        age=np.full(size, EMPTY),
         quality=np.zeros(1),
         gain=gain,
+        oldest=oldest,
     )
 
 
 @compiled
 def offer(stack: HistoryStack, Y: Array, U: Array) -> None:
     """Show the stack a pair Y (m, p), U (m,), for it to keep or not."""
-    size, counts = stack.U.shape[0], stack.counts
-    if counts[FILLED] < size:
-        _put(stack, counts[FILLED], Y, U)
-        counts[FILLED] += 1
-    elif stack.quality[0] == 0.0:
-        _put(stack, counts[OLDEST], Y, U)
-        counts[OLDEST] = (counts[OLDEST] + 1) % size
-    else:
+    place = 0
+    for k in range(stack.age.size):
+        stack.age[k] = min(stack.age[k] + 1, EMPTY)
+        if stack.age[k] > stack.age[place]:
+            place = k
+    if stack.quality[0] > 0.0 and stack.age[place] < stack.oldest:
         place = _best_place(stack, Y)
-        if place < 0:
-            return
-        _put(stack, place, Y, U)
+    if place < 0:
+        return
+    stack.age[place] = 0
+    for e in range(U.size):
+        stack.U[place, e] = U[e]
+        for i in range(Y.shape[1]):
+            stack.Y[place, e, i] = Y[e, i]
     refresh(stack)
 
 
@@ -135,14 +144,6 @@ def smallest_eigenvalue(S: Array, L: Array) -> float:
         else:
             above = middle
     return below
-
-
-@compiled
-def _put(stack: HistoryStack, place: int, Y: Array, U: Array) -> None:
-    for e in range(U.size):
-        stack.U[place, e] = U[e]
-        for i in range(Y.shape[1]):
-            stack.Y[place, e, i] = Y[e, i]
 
 
 @compiled

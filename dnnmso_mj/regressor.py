@@ -108,12 +108,12 @@ def refuse_other_arms(nominal: NominalModel, kind: str) -> None:
     """
     n = nominal.view.M.shape[0]
     if n != 2 or not _fits(nominal):
-        what = f"{n} joints" if n != 2 else "an arm of another form"
+        what = f"a robot of {n} joint{'s' * (n != 1)}" if n != 2 else "this arm"
         raise ScenarioError(
-            f"controller.kind = {kind}: its regressor does not fit a robot with {what}; allowed: "
-            "two hinges about one horizontal axis, q1 from the horizontal and q2 from link 1, "
-            "centres of mass along the links. For other robots take a controller without a "
-            "regressor, dnn_mso say"
+            f"controller.kind = {kind}: its regressor does not fit {what}; allowed: "
+            "two hinges about parallel axes, q1 from the horizontal and q2 from link 1, centres of "
+            "mass along the links. For other robots take a controller without a regressor, such as "
+            "dnn_mso"
         )
 
 

@@ -13,8 +13,8 @@ with the motion at hand exciting or not.
 
 The record lives in the coordinates φ = Γ^(−½) θ, in which λ_min is the slowest rate of learning.
 
-N.B. the record never grows old: what it says of a robot that has since taken up a load is wrong,
-and pulls against the first term.
+N.B. without `max_age` the record never grows old: what it says of a robot that has since taken up a
+load is wrong, and pulls against the first term.
 
 Source: Chowdhary, Johnson, "Concurrent learning for convergence in adaptive control without
 persistency of excitation", IEEE Conf. Decision and Control 2010; Parikh, Kamalapurkar, Dixon,
@@ -32,7 +32,7 @@ import numpy as np
 from dnnmso_mj.compiling import compiled, inner
 from dnnmso_mj.controllers import Command, CompiledTicks, Inputs
 from dnnmso_mj.controllers.slotine_li import Law, adapt, build_command, build_law, show, track
-from dnnmso_mj.history_stack import HistoryStack, build_stack, learn, offer, refresh
+from dnnmso_mj.history_stack import EMPTY, HistoryStack, build_stack, learn, offer, refresh
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.regressor import N_PARAMETERS, drift, momentum, momentum_loss, refuse_other_arms
 from dnnmso_mj.scenario import ConcurrentLearning
@@ -80,6 +80,9 @@ class ConcurrentLearningController:
     def __init__(self, spec: ConcurrentLearning, dt: float, nominal: NominalModel) -> None:
         refuse_other_arms(nominal, spec.kind)
         law = build_law(spec, dt)
+        length = max(1, round(spec.window / dt))
+        oldest = EMPTY if spec.max_age is None else max(1, round(spec.max_age / (length * dt)))
+        stack = build_stack((spec.stack, 2, N_PARAMETERS), dt * spec.k_CL, oldest)
         Y, loss, here = np.zeros((3, 2, N_PARAMETERS))
         window = Window(
             Y=Y,
@@ -89,9 +92,8 @@ class ConcurrentLearningController:
             scale=np.sqrt(law.Gamma),
             phi=np.zeros(N_PARAMETERS),
             periods=np.array([-1]),
-            length=max(1, round(spec.window / dt)),
+            length=length,
         )
-        stack = build_stack(spec.stack, 2, N_PARAMETERS, dt * spec.k_CL)
         self._parts = Parts(law, window, stack, build_command())
         self.ticks = CompiledTicks(run_ticks, self._parts, ConcurrentLearningController.update)
 
@@ -117,7 +119,7 @@ class ConcurrentLearningController:
             "window_periods": window.periods,
             "stack_Y": stack.Y,
             "stack_U": stack.U,
-            "stack_counts": stack.counts,
+            "stack_age": stack.age,
         }
         return {name: array.copy() for name, array in kept.items()}
 
@@ -127,7 +129,7 @@ class ConcurrentLearningController:
         window.Y[:], window.U[:] = state["window_Y"], state["window_U"]
         window.loss[:], window.periods[:] = state["window_loss"], state["window_periods"]
         stack.Y[:], stack.U[:] = state["stack_Y"], state["stack_U"]
-        stack.counts[:] = state["stack_counts"]
+        stack.age[:] = state["stack_age"]
         refresh(stack)
 
 
