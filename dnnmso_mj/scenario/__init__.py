@@ -49,6 +49,7 @@ __all__ = [
     "DnnMso",
     "Effectiveness",
     "Event",
+    "ExpSinusoid",
     "Freeze",
     "Imperfections",
     "Inertia",
@@ -132,6 +133,19 @@ class Sinusoid(Strict):
     """Centre of the oscillation (rad)."""
 
 
+class ExpSinusoid(Strict):
+    """q_ref,i(t) = amplitude_i exp(-sin(frequency_i t)) sin(frequency_i t + phase_i)."""
+
+    kind: Literal["exp_sinusoid"]
+    """A sine whose size swells and shrinks with it, of the Lyapunov-based DNN papers."""
+    amplitude: FiniteEach = (0.25,)
+    """Amplitude (rad) where the swelling is 1; it goes from 1/e to e."""
+    frequency: FiniteEach = (1.0,)
+    """Angular frequency (rad/s)."""
+    phase: FiniteEach = (0.0,)
+    """Phase (rad); pi/2 makes a cosine."""
+
+
 class Setpoint(Strict):
     """Rest at `start`, one quintic (minimum-jerk) blend, rest at `goal`."""
 
@@ -169,7 +183,7 @@ class Waypoints(Strict):
         return self
 
 
-Reference = Annotated[Sinusoid | Setpoint | Waypoints, Field(discriminator="kind")]
+Reference = Annotated[Sinusoid | ExpSinusoid | Setpoint | Waypoints, Field(discriminator="kind")]
 
 
 class Imperfections(Strict):
