@@ -21,6 +21,7 @@ from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
 KINDS = ("slotine_li", "concurrent_learning")
 LINKS = ("point_mass", "rod")
 REST = {"kind": "setpoint", "start": [0.5, 0.5], "goal": [1.0, 0.2], "blend_time": 1.0}
+MOVING = {"kind": "sinusoid", "frequency": [2.0, 3.0]}
 SHORT = {  # moves for 3 s, then rests
     "kind": "waypoints",
     "times": [0.0, 0.7, 1.4, 2.2, 3.0],
@@ -186,6 +187,27 @@ def test_concurrent_learning_finds_the_parameters_and_goes_on_at_rest(make_scena
     x = np.array([0.3, -0.8, 1.0, 2.0])
     f_hat = simulation.controller.dynamics(x)
     assert np.allclose(f_hat, ARM.acceleration(x[:2], x[2:], np.zeros(2)), atol=0.05)
+
+
+@pytest.mark.parametrize(("max_age", "forgets"), [(None, False), (2.0, True)])
+def test_only_a_record_that_grows_old_follows_a_robot_that_changes(
+    make_scenario, two_link, max_age, forgets
+):
+    """The second mass goes from 2.3 to 3.5 kg after 5 s."""
+    error, state = 0.0, None
+    for mass in (2.3, 3.5):
+        controller = {"kind": "concurrent_learning", "max_age": max_age}
+        scenario = make_scenario(controller, plant={"masses": [1.0, mass]}, reference=MOVING)
+        simulation = Simulation(scenario, two_link)
+        if state:
+            simulation.controller.restore(state)
+        for _ in drive(simulation, 5.0):
+            pass
+        state = simulation.controller.state()
+        truth = parameters(TwoLink((1.0, mass), (1.0, 1.0)))
+        error = float(np.abs(law(simulation).theta - truth).max())
+        assert mass != 2.3 or error < 0.1
+    assert (error < 0.1) == forgets
 
 
 @pytest.mark.parametrize("links", LINKS)
