@@ -27,11 +27,9 @@ import numpy as np
 from dnnmso_mj.compiling import compiled
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.plant import NominalModel
+from dnnmso_mj.scenario.adaptive import N_PARAMETERS
 
 Array = np.ndarray
-
-N_PARAMETERS = 7
-NAMES = ("p1", "p2", "p3", "g1", "g2", "f1", "f2")
 
 # Below this ratio of det M̂ to (tr M̂)² an estimate is no inertia that could be inverted.
 SINGULAR_BELOW = 1e-6

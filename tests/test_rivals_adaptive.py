@@ -15,7 +15,8 @@ from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.plant import Mjcf, NominalModel
 from dnnmso_mj.reference import Reference
-from dnnmso_mj.regressor import N_PARAMETERS, drift, momentum, momentum_loss, regressor
+from dnnmso_mj.regressor import drift, momentum, momentum_loss, regressor
+from dnnmso_mj.scenario.adaptive import N_PARAMETERS
 from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
 
 KINDS = ("slotine_li", "concurrent_learning")

@@ -34,8 +34,9 @@ from dnnmso_mj.controllers import Command, CompiledTicks, Inputs
 from dnnmso_mj.controllers.slotine_li import Law, adapt, build_command, build_law, show, track
 from dnnmso_mj.history_stack import EMPTY, HistoryStack, build_stack, learn, offer, refresh
 from dnnmso_mj.plant import NominalModel
-from dnnmso_mj.regressor import N_PARAMETERS, drift, momentum, momentum_loss, refuse_other_arms
+from dnnmso_mj.regressor import drift, momentum, momentum_loss, refuse_other_arms
 from dnnmso_mj.scenario import ConcurrentLearning
+from dnnmso_mj.scenario.adaptive import N_PARAMETERS
 from dnnmso_mj.tick import closed_loop
 
 Array = np.ndarray

@@ -23,8 +23,9 @@ from dnnmso_mj.compiling import compiled, copy, inner
 from dnnmso_mj.controllers import Command, CompiledTicks, Inputs
 from dnnmso_mj.monitors import Monitors
 from dnnmso_mj.plant import NominalModel
-from dnnmso_mj.regressor import N_PARAMETERS, drift, refuse_other_arms, regressor
+from dnnmso_mj.regressor import drift, refuse_other_arms, regressor
 from dnnmso_mj.scenario import ConcurrentLearning, SlotineLi, expand
+from dnnmso_mj.scenario.adaptive import N_PARAMETERS
 from dnnmso_mj.tick import closed_loop
 
 Array = np.ndarray
