@@ -139,12 +139,13 @@ def _controller_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, 
 
 def _reference_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:
     ref = scenario.reference
-    if ref.kind == "sinusoid":
-        for name in ("amplitude", "frequency", "phase", "offset"):
-            yield f"reference.{name}", len(getattr(ref, name)), {1, n}
-    elif ref.kind == "setpoint":
+    if ref.kind == "setpoint":
         yield "reference.start", len(ref.start), {n}
         yield "reference.goal", len(ref.goal), {n}
-    else:
+    elif ref.kind == "waypoints":
         for k, point in enumerate(ref.points):
             yield f"reference.points.{k}", len(point), {n}
+    else:
+        for name in ("amplitude", "frequency", "phase", "offset"):
+            if hasattr(ref, name):
+                yield f"reference.{name}", len(getattr(ref, name)), {1, n}

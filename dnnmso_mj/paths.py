@@ -8,6 +8,7 @@ from dnnmso_mj.errors import DnnmsoError, ScenarioError
 from dnnmso_mj.wording import clean, did_you_mean, show
 
 PACKAGE = Path(__file__).resolve().parent
+LITERATURE = "literature"
 
 
 def models_dir() -> Path:
@@ -25,8 +26,17 @@ def logs_dir() -> Path:
     return Path.cwd() / "logs"
 
 
+def scenario_names() -> list[str]:
+    """Names of the shipped scenarios: our own, then other papers' as "literature/…"."""
+    folder = scenarios_dir()
+    return [
+        *_names(folder, ".yaml"),
+        *(f"{LITERATURE}/{name}" for name in _names(folder / LITERATURE, ".yaml")),
+    ]
+
+
 def find_scenario(source: str | Path) -> Path:
-    """Find a scenario by path, or by the name of a shipped one ("paper", "paper.yaml").
+    """Find a scenario by path, or by the name of a shipped one ("paper", "literature/lewis").
 
     Raises:
         ScenarioError: no such file, a directory or device, or a name that does not ship.
@@ -34,7 +44,7 @@ def find_scenario(source: str | Path) -> Path:
     path = Path(source)
     if _is_file(path):
         return path
-    names = _names(scenarios_dir(), ".yaml")
+    names = scenario_names()
     name = str(source).removesuffix(".yaml")
     if name in names:
         return scenarios_dir() / f"{name}.yaml"

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from dnnmso_mj.scenario import ExpSinusoid, Setpoint, Sinusoid, Waypoints, expand
 from dnnmso_mj.scenario import Reference as ReferenceSpec
-from dnnmso_mj.scenario import Setpoint, Sinusoid, Waypoints, expand
 
 Array = np.ndarray
 Samples = tuple[Array, Array, Array]
@@ -26,6 +26,8 @@ class Reference:
         match spec:
             case Sinusoid():
                 self._sample = _sinusoid(spec, n_joints)
+            case ExpSinusoid():
+                self._sample = _exp_sinusoid(spec, n_joints)
             case Setpoint():
                 self._sample = _setpoint(spec)
             case Waypoints():
@@ -44,6 +46,20 @@ def _sinusoid(spec: Sinusoid, n: int) -> Callable[[Array], Samples]:
         angle = t[:, None] * w + phase  # (N, n)
         sine = amplitude * np.sin(angle)
         return offset + sine, amplitude * w * np.cos(angle), -(w**2) * sine
+
+    return sample
+
+
+def _exp_sinusoid(spec: ExpSinusoid, n: int) -> Callable[[Array], Samples]:
+    amplitude, w, phase = (expand(v, n) for v in (spec.amplitude, spec.frequency, spec.phase))
+
+    def sample(t: Array) -> Samples:
+        angle = t[:, None] * w  # (N, n)
+        s, c = np.sin(angle), np.cos(angle)
+        sine, cosine = np.sin(angle + phase), np.cos(angle + phase)
+        size = amplitude * np.exp(-s)
+        acceleration = (c**2 + s - 1) * sine - 2 * c * cosine
+        return size * sine, size * w * (cosine - c * sine), size * w**2 * acceleration
 
     return sample
 

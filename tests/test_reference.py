@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from dnnmso_mj.reference import Reference
-from dnnmso_mj.scenario import Setpoint, Sinusoid, Waypoints
+from dnnmso_mj.scenario import ExpSinusoid, Setpoint, Sinusoid, Waypoints
 
 PAPER = Sinusoid(kind="sinusoid", phase=[0.0, np.pi / 2])
 SPECS = {
     "sinusoid": Sinusoid(
         kind="sinusoid", amplitude=[0.3, 2.0], frequency=[2.0, 0.7], phase=[0.1], offset=[0.5]
+    ),
+    "exp_sinusoid": ExpSinusoid(
+        kind="exp_sinusoid", amplitude=[0.3, 2.0], frequency=[2.0, 0.7], phase=[0.1, 1.0]
     ),
     "setpoint": Setpoint(
         kind="setpoint", start=[0.5, -1.0], goal=[1.5, 0.0], start_time=0.5, blend_time=2.0

@@ -10,7 +10,15 @@ import numpy as np
 from dnnmso_mj.inversion import DynamicInversion
 from dnnmso_mj.monitors import Monitors
 from dnnmso_mj.plant import Mjcf, NominalModel
-from dnnmso_mj.scenario import ClassicalMso, DnnMso, DnnMsoReplay, NoNetwork, Scenario
+from dnnmso_mj.scenario import (
+    ClassicalMso,
+    ConcurrentLearning,
+    DnnMso,
+    DnnMsoReplay,
+    NoNetwork,
+    Scenario,
+    SlotineLi,
+)
 from dnnmso_mj.scenario.rivals import Rival
 
 if TYPE_CHECKING:
@@ -119,10 +127,12 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
         watch: whether the monitors of the network are kept; they change nothing else.
     """
     from dnnmso_mj.controllers.classical_mso import ClassicalMsoController
+    from dnnmso_mj.controllers.concurrent_learning import ConcurrentLearningController
     from dnnmso_mj.controllers.dnn_mso import DnnMsoController
     from dnnmso_mj.controllers.dnn_mso_replay import DnnMsoReplayController
     from dnnmso_mj.controllers.no_network import NoNetworkController
     from dnnmso_mj.controllers.rivals import build_rival
+    from dnnmso_mj.controllers.slotine_li import SlotineLiController
 
     nominal = NominalModel(scenario, mjcf)
     spec, n, dt = scenario.controller, scenario.n_joints, scenario.dt
@@ -137,3 +147,7 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
             return NoNetworkController(spec, n, dt, nominal)
         case ClassicalMso():
             return ClassicalMsoController(spec, n, dt, scenario.seed, nominal, watch=watch)
+        case SlotineLi():
+            return SlotineLiController(spec, dt, nominal)
+        case ConcurrentLearning():
+            return ConcurrentLearningController(spec, dt, nominal)

@@ -17,7 +17,7 @@ from dnnmso_mj.loading.documents import Node, Problem, read_document
 from dnnmso_mj.loading.overrides import Override, apply_overrides, parse_overrides
 from dnnmso_mj.loading.places import Places
 from dnnmso_mj.loading.shape import Shape, lookup, scenario_schema
-from dnnmso_mj.paths import find_model, find_scenario, model_name, scenarios_dir
+from dnnmso_mj.paths import find_model, find_scenario, model_name, scenario_names, scenarios_dir
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.wording import clean
 
@@ -96,8 +96,8 @@ def located(
 
 def list_scenarios() -> list[tuple[str, str]]:
     """Name and description of every shipped scenario, by name."""
-    files = sorted(scenarios_dir().glob("*.yaml"))
-    return [(file.stem, load_scenario(file).description) for file in files]
+    folder = scenarios_dir()
+    return [(n, load_scenario(folder / f"{n}.yaml").description) for n in scenario_names()]
 
 
 def _read(file: Path) -> str:

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from dnnmso_mj.consistency import contradictions, entries
+from dnnmso_mj.scenario.adaptive import ConcurrentLearning, SlotineLi
 from dnnmso_mj.scenario.controller import (
     ClassicalMso,
     Controller,
@@ -46,12 +47,14 @@ __all__ = [
     "Adrc",
     "ClassicalMso",
     "ComputedTorque",
+    "ConcurrentLearning",
     "Constant",
     "Controller",
     "DnnMso",
     "DnnMsoReplay",
     "Effectiveness",
     "Event",
+    "ExpSinusoid",
     "Freeze",
     "Friction",
     "Imperfections",
@@ -75,6 +78,7 @@ __all__ = [
     "Setpoint",
     "Sinusoid",
     "SlidingMode",
+    "SlotineLi",
     "Stall",
     "Waypoints",
     "expand",
@@ -142,6 +146,19 @@ class Sinusoid(Strict):
     """Centre of the oscillation (rad)."""
 
 
+class ExpSinusoid(Strict):
+    """q_ref,i(t) = amplitude_i exp(-sin(frequency_i t)) sin(frequency_i t + phase_i)."""
+
+    kind: Literal["exp_sinusoid"]
+    """A sine whose size swells and shrinks with it, of the Lyapunov-based DNN papers."""
+    amplitude: FiniteEach = (0.25,)
+    """Amplitude (rad) where the swelling is 1; it goes from 1/e to e."""
+    frequency: FiniteEach = (1.0,)
+    """Angular frequency (rad/s)."""
+    phase: FiniteEach = (0.0,)
+    """Phase (rad); pi/2 makes a cosine."""
+
+
 class Setpoint(Strict):
     """Rest at `start`, one quintic (minimum-jerk) blend, rest at `goal`."""
 
@@ -179,7 +196,7 @@ class Waypoints(Strict):
         return self
 
 
-Reference = Annotated[Sinusoid | Setpoint | Waypoints, Field(discriminator="kind")]
+Reference = Annotated[Sinusoid | ExpSinusoid | Setpoint | Waypoints, Field(discriminator="kind")]
 
 
 class Stall(Strict):

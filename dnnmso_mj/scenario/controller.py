@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from dnnmso_mj.scenario.adaptive import ConcurrentLearning, SlotineLi
 from dnnmso_mj.scenario.effectiveness import Constant, Effectiveness, Inertia
 from dnnmso_mj.scenario.fields import (
     Matrix,
@@ -265,7 +266,8 @@ class DnnMsoReplay(Strict):
 
 
 Controller = Annotated[
-    DnnMso | NoNetwork | ClassicalMso | DnnMsoReplay | Rival, Field(discriminator="kind")
+    DnnMso | NoNetwork | ClassicalMso | DnnMsoReplay | SlotineLi | ConcurrentLearning | Rival,
+    Field(discriminator="kind"),
 ]
 
 
