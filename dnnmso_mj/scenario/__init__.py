@@ -20,7 +20,6 @@ from dnnmso_mj.scenario.controller import (
     Effectiveness,
     Inertia,
     Inversion,
-    Madam,
     Network,
     NoNetwork,
     Observer,
@@ -37,9 +36,12 @@ from dnnmso_mj.scenario.fields import (
     expand,
     refusal,
 )
+from dnnmso_mj.scenario.optimizers import Adam, ByMadam, Madam, Rule, Sgd, SignSgd
 
 __all__ = [
     "PAPER_MODEL",
+    "Adam",
+    "ByMadam",
     "ClassicalMso",
     "Constant",
     "Controller",
@@ -56,8 +58,11 @@ __all__ = [
     "Plant",
     "RealTime",
     "Reference",
+    "Rule",
     "Scenario",
     "Setpoint",
+    "Sgd",
+    "SignSgd",
     "Sinusoid",
     "Stall",
     "Waypoints",

@@ -18,6 +18,7 @@ from dnnmso_mj.scenario.fields import (
     as_tuple,
     refusal,
 )
+from dnnmso_mj.scenario.optimizers import ByMadam, Madam, Optimizer, Rule, check_resolvable, chosen
 
 MAX_WEIGHTS = 10_000_000
 
@@ -55,41 +56,6 @@ class Network(Strict):
             allowed = f"allowed: at most {MAX_WEIGHTS} between hidden layers"
             raise refusal(("hidden", f"makes {weights} weights; {allowed}"))
         return self
-
-
-class Madam(Strict):
-    """Multiplicative adaptive moments, Alg. 1 of the paper."""
-
-    eta: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.001
-    """Learning rate η."""
-    eta_max: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.1
-    """η*, the largest exponent of one update; the paper's 100 η."""
-    sigma_max: Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)] = 1250.0
-    """σ*, the largest magnitude of a weight."""
-    beta: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.999
-    """β, the forgetting factor of the second moment."""
-    bias_correction: bool = False
-    """Divide the second moment by 1 - β^k, as Adam does; the paper's algorithm does not."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Madam:
-        if self.eta_max < self.eta:
-            problem = f"is below eta = {self.eta}; allowed: eta_max >= eta"
-            raise refusal(("eta_max", problem))
-        return self
-
-
-def _resolvable(madam: Madam, network: Network) -> None:
-    """Refuse learning whose smallest steps are rounded away in the network's arithmetic."""
-    eps = float(np.finfo(network.precision).eps)
-    least = f"2^{round(np.log2(eps))} = {eps:.2g}, what {network.precision} resolves"
-    if madam.eta < eps:
-        raise refusal(
-            ("madam.eta", f"would leave every weight as it is; allowed: {least}, or more")
-        )
-    if 1 - madam.beta < eps:
-        problem = f"would never take in a gradient; allowed: 1 - beta of {least}, or more"
-        raise refusal(("madam.beta", problem))
 
 
 class Observer(Strict):
@@ -163,12 +129,19 @@ class DnnMso(Strict):
     network: Network = Network()
     """The learned dynamics."""
     madam: Madam = Madam()
-    """The weight update."""
+    """The paper's weight update."""
+    optimizer: Optimizer = ByMadam(kind="madam")
+    """Which rule updates the weights."""
 
     @model_validator(mode="after")
     def _learns(self) -> DnnMso:
-        _resolvable(self.madam, self.network)
+        check_resolvable(self.rule, self.network.precision)
         return self
+
+    @property
+    def rule(self) -> Rule:
+        """The settings of the rule that updates the weights."""
+        return chosen(self.optimizer, self.madam)
 
 
 class NoNetwork(Strict):
@@ -196,7 +169,9 @@ class ClassicalMso(Strict):
     network: Network = Network()
     """The learned dynamics."""
     madam: Madam = Madam()
-    """The weight update."""
+    """The paper's weight update."""
+    optimizer: Optimizer = ByMadam(kind="madam")
+    """Which rule updates the weights."""
 
     @model_validator(mode="after")
     def _needs_a_model(self) -> ClassicalMso:
@@ -206,8 +181,13 @@ class ClassicalMso(Strict):
         if self.network.outputs != "full":
             problem = "has no meaning for classical_mso, which learns a torque; allowed: full"
             raise refusal(("network.outputs", problem))
-        _resolvable(self.madam, self.network)
+        check_resolvable(self.rule, self.network.precision)
         return self
+
+    @property
+    def rule(self) -> Rule:
+        """The settings of the rule that updates the weights."""
+        return chosen(self.optimizer, self.madam)
 
 
 Controller = Annotated[DnnMso | NoNetwork | ClassicalMso, Field(discriminator="kind")]
