@@ -10,7 +10,7 @@ import numpy as np
 from dnnmso_mj.inversion import DynamicInversion
 from dnnmso_mj.monitors import Monitors
 from dnnmso_mj.plant import Mjcf, NominalModel
-from dnnmso_mj.scenario import ClassicalMso, DnnMso, NoNetwork, Scenario
+from dnnmso_mj.scenario import Backstepping, ClassicalMso, DnnMso, NoNetwork, Scenario
 
 if TYPE_CHECKING:
     from dnnmso_mj.tick import Loop
@@ -117,6 +117,7 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
         mjcf: the model that it names.
         watch: whether the monitors of the network are kept; they change nothing else.
     """
+    from dnnmso_mj.controllers.backstepping import BacksteppingController
     from dnnmso_mj.controllers.classical_mso import ClassicalMsoController
     from dnnmso_mj.controllers.dnn_mso import DnnMsoController
     from dnnmso_mj.controllers.no_network import NoNetworkController
@@ -130,3 +131,5 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
             return NoNetworkController(spec, n, dt, nominal)
         case ClassicalMso():
             return ClassicalMsoController(spec, n, dt, scenario.seed, nominal, watch=watch)
+        case Backstepping():
+            return BacksteppingController(spec, n, dt, scenario.seed, nominal, watch=watch)

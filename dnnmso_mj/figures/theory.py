@@ -25,7 +25,7 @@ from dnnmso_mj.figures.drawing import (
     subscript,
 )
 from dnnmso_mj.metrics import worst_error
-from dnnmso_mj.scenario import NoNetwork
+from dnnmso_mj.scenario import Madam, NoNetwork
 from dnnmso_mj.scenario.controller import inversion as inversion_of
 from dnnmso_mj.trace import Array, Trace
 
@@ -89,7 +89,7 @@ def _update_ratios(ax: Axes, trace: Trace) -> None:
 def _theorem_1(ax: Axes, trace: Trace) -> None:
     _layers(ax, trace["t"], trace["eta_bound"], log_line)
     controller = trace.scenario.controller
-    if not isinstance(controller, NoNetwork):
+    if not isinstance(controller, NoNetwork) and isinstance(controller.rule, Madam):
         ax.axhline(controller.madam.eta, color=INK, label="η used", **DASHED)
     _name(ax, trace, "Theorem 1", "bound on η (–)")
 

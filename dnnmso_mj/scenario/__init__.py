@@ -12,19 +12,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from dnnmso_mj.consistency import contradictions, entries
-from dnnmso_mj.scenario.controller import (
-    ClassicalMso,
-    Constant,
-    Controller,
-    DnnMso,
-    Effectiveness,
-    Inertia,
-    Inversion,
-    Madam,
-    Network,
-    NoNetwork,
-    Observer,
-)
+from dnnmso_mj.scenario.backstepping import Backstepping
+from dnnmso_mj.scenario.controller import ClassicalMso, Controller, DnnMso, Inversion, NoNetwork
+from dnnmso_mj.scenario.effectiveness import Constant, Effectiveness, Inertia
 from dnnmso_mj.scenario.events import Event, Freeze
 from dnnmso_mj.scenario.fields import (
     FiniteEach,
@@ -38,9 +28,14 @@ from dnnmso_mj.scenario.fields import (
     expand,
     refusal,
 )
+from dnnmso_mj.scenario.learning import Network, Observer
+from dnnmso_mj.scenario.optimizers import Adam, ByMadam, Madam, Rule, Sgd, SignSgd
 
 __all__ = [
     "PAPER_MODEL",
+    "Adam",
+    "Backstepping",
+    "ByMadam",
     "ClassicalMso",
     "Constant",
     "Controller",
@@ -59,8 +54,11 @@ __all__ = [
     "Plant",
     "RealTime",
     "Reference",
+    "Rule",
     "Scenario",
     "Setpoint",
+    "Sgd",
+    "SignSgd",
     "Sinusoid",
     "Stall",
     "Waypoints",

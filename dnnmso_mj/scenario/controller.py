@@ -5,125 +5,13 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from dnnmso_mj.scenario.fields import (
-    Matrix,
-    NonNegative,
-    Positive,
-    PositiveEach,
-    Positives,
-    Strict,
-    WeightScale,
-    as_tuple,
-    refusal,
-)
-
-MAX_WEIGHTS = 10_000_000
-
-
-class Network(Strict):
-    """The deep network f̂ and its initial weights."""
-
-    hidden: Annotated[
-        tuple[Annotated[int, Field(ge=1, le=4096)], ...],
-        Field(min_length=1, max_length=32),
-        BeforeValidator(as_tuple),
-    ] = (64, 64, 64)
-    """Width of each hidden layer; three hidden layers make the paper's four weight layers."""
-    activation: Literal["sigmoid", "tanh", "relu"] = "sigmoid"
-    """Activation of the hidden layers; the output layer is linear."""
-    outputs: Literal["full", "kinematic"] = "full"
-    """full: all 2n rows are learned (paper). kinematic: the upper n rows are the measured q̇."""
-    bias: bool = True
-    """Whether each layer sees a constant 1 beside its inputs."""
-    init_scale: WeightScale | None = None
-    """Kumar's constant: spread = init_scale/√fan_in. null: the activation's own (sigmoid 3.6)."""
-    init_spread: Literal["standard_deviation", "variance"] = "standard_deviation"
-    """Whether init_scale/√fan_in is a standard deviation or a variance; the paper does not say."""
-    output_scale: WeightScale = 1.0
-    """Factor on the initial weights of the output layer."""
-    backend: Literal["kernel", "torch"] = "kernel"
-    """kernel: compiled (fast). torch: the reference that the kernel is tested against (slow)."""
-    precision: Literal["float64", "float32"] = "float32"
-    """Arithmetic of the network: float32, torch's own default, takes half the time of float64."""
-
-    @model_validator(mode="after")
-    def _fits_in_memory(self) -> Network:
-        weights = sum(a * b for a, b in zip(self.hidden, self.hidden[1:], strict=False))
-        if weights > MAX_WEIGHTS:
-            allowed = f"allowed: at most {MAX_WEIGHTS} between hidden layers"
-            raise refusal(("hidden", f"makes {weights} weights; {allowed}"))
-        return self
-
-
-class Madam(Strict):
-    """Multiplicative adaptive moments, Alg. 1 of the paper."""
-
-    eta: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.001
-    """Learning rate η."""
-    eta_max: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.1
-    """η*, the largest exponent of one update; the paper's 100 η."""
-    sigma_max: Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)] = 1250.0
-    """σ*, the largest magnitude of a weight."""
-    beta: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.999
-    """β, the forgetting factor of the second moment."""
-    bias_correction: bool = False
-    """Divide the second moment by 1 - β^k, as Adam does; the paper's algorithm does not."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Madam:
-        if self.eta_max < self.eta:
-            problem = f"is below eta = {self.eta}; allowed: eta_max >= eta"
-            raise refusal(("eta_max", problem))
-        return self
-
-
-def _resolvable(madam: Madam, network: Network) -> None:
-    """Refuse learning whose smallest steps are rounded away in the network's arithmetic."""
-    eps = float(np.finfo(network.precision).eps)
-    least = f"2^{round(np.log2(eps))} = {eps:.2g}, what {network.precision} resolves"
-    if madam.eta < eps:
-        raise refusal(
-            ("madam.eta", f"would leave every weight as it is; allowed: {least}, or more")
-        )
-    if 1 - madam.beta < eps:
-        problem = f"would never take in a gradient; allowed: 1 - beta of {least}, or more"
-        raise refusal(("madam.beta", problem))
-
-
-class Observer(Strict):
-    """The state observer of Eq. 5."""
-
-    K2: PositiveEach = (30.0,)
-    """Observer gain (1/s): one number, or one for each of the 2n states."""
-    feedback: Literal["stable", "as_printed"] = "stable"
-    """stable: +K₂(X - X̂). as_printed: the paper's sign, which diverges."""
-    torque: Literal["commanded", "applied"] = "commanded"
-    """The torque that it takes for u: its own command (paper), or what the drives say acted."""
-
-
-class Inertia(Strict):
-    """B₂ = M(q)⁻¹ of the controller's nominal model."""
-
-    kind: Literal["inertia"]
-    """B from a nominal model."""
-    masses: Positives | None = None
-    """Masses that the controller believes (kg); null: the plant's."""
-    lengths: Positives | None = None
-    """Lengths that the controller believes (m); null: the plant's."""
-
-
-class Constant(Strict):
-    """B₂ = b·I: no model at all."""
-
-    kind: Literal["constant"]
-    """B without a model."""
-    b: Positive = 1.0
-    """Control effectiveness (1/(kg·m²))."""
-
-
-Effectiveness = Annotated[Inertia | Constant, Field(discriminator="kind")]
+from dnnmso_mj.scenario.backstepping import Backstepping
+from dnnmso_mj.scenario.effectiveness import Constant, Effectiveness, Inertia
+from dnnmso_mj.scenario.fields import Matrix, NonNegative, PositiveEach, Strict, refusal
+from dnnmso_mj.scenario.learning import Network, Observer
+from dnnmso_mj.scenario.optimizers import ByMadam, Madam, Optimizer, Rule, check_resolvable, chosen
 
 
 class Inversion(Strict):
@@ -165,12 +53,19 @@ class DnnMso(Strict):
     network: Network = Network()
     """The learned dynamics."""
     madam: Madam = Madam()
-    """The weight update."""
+    """The paper's weight update."""
+    optimizer: Optimizer = ByMadam(kind="madam")
+    """Which rule updates the weights."""
 
     @model_validator(mode="after")
     def _learns(self) -> DnnMso:
-        _resolvable(self.madam, self.network)
+        check_resolvable(self.rule, self.network.precision)
         return self
+
+    @property
+    def rule(self) -> Rule:
+        """The settings of the rule that updates the weights."""
+        return chosen(self.optimizer, self.madam)
 
 
 class NoNetwork(Strict):
@@ -198,7 +93,9 @@ class ClassicalMso(Strict):
     network: Network = Network()
     """The learned dynamics."""
     madam: Madam = Madam()
-    """The weight update."""
+    """The paper's weight update."""
+    optimizer: Optimizer = ByMadam(kind="madam")
+    """Which rule updates the weights."""
 
     @model_validator(mode="after")
     def _needs_a_model(self) -> ClassicalMso:
@@ -208,11 +105,16 @@ class ClassicalMso(Strict):
         if self.network.outputs != "full":
             problem = "has no meaning for classical_mso, which learns a torque; allowed: full"
             raise refusal(("network.outputs", problem))
-        _resolvable(self.madam, self.network)
+        check_resolvable(self.rule, self.network.precision)
         return self
 
+    @property
+    def rule(self) -> Rule:
+        """The settings of the rule that updates the weights."""
+        return chosen(self.optimizer, self.madam)
 
-Controller = Annotated[DnnMso | NoNetwork | ClassicalMso, Field(discriminator="kind")]
+
+Controller = Annotated[DnnMso | NoNetwork | ClassicalMso | Backstepping, Field(discriminator="kind")]
 
 
 def inversion(controller: Controller) -> Inversion | None:
