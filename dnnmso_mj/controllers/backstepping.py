@@ -1,20 +1,12 @@
-"""The learned dynamics in a command filtered backstepping law, of two steps or three.
+"""DNN-MSO in a backstepping law: the paper's future work, for drives with a lag too.
 
-    ẋ₁ = x₂ + d₁(x),   ẋ₂ = f₂(x) + B₂ τ,   T τ̇ = τ_cmd − τ
+    X̂̇ = f̂(X) + B τ + K₂ e_a          (Eq. 5, with the stable sign and the torque that acted)
+    τ_cmd: `dnnmso_mj.backstepping` with f̂ + K₂ e_a
+    W  ← Madam(W, ∂½‖e_a‖²/∂W)         (Alg. 1)
 
-    α₁ = q̇_ref − K_q e₁ − d̂₁                            e₁ = x₁ − q_ref
-    α₂ = B₂⁻¹ (v̇_c − f̂₂ − K_v z₂ − w₁)                  z₂ = x₂ − v_c,   v_c: α₁ filtered
-    τ_cmd = τ + T (τ̇_c − B₂ᵀ w₂ − K_τ z₃)               z₃ = τ − τ_c,    τ_c: α₂ filtered
-
-    w₁ = e₁ − ξ₁,   ξ̇₁ = −K_q ξ₁ + ξ₂ + v_c − α₁
-    w₂ = z₂ − ξ₂,   ξ̇₂ = −K_v ξ₂ + B₂ (τ_c − α₂)
-
-Without `actuator_lag` the law ends with τ_cmd = α₂, and ξ₂ = 0. f̂ is the network's, learned as the
-paper does from the observer's error, with the observer's K₂ e_a added in the law. The derivation,
-V̇ ≤ −κ‖w‖² + ε‖w‖, and what sampling does to it are in docs/backstepping.md.
-
-Source: Farrell, Polycarpou, Sharma, Dong, "Command filtered backstepping", IEEE Transactions on
-Automatic Control 54(6), 2009, with the deep network of the paper, whose future work this is.
+N.B. the upper rows of f̂ are x₂, or x₂ + d̂₁ with a learned d̂₁ (`network.outputs: full`). The paper's
+network learns them whole; a law that takes x₂ for its handle on x₁ is then lost, since before it
+has learned the network says nothing of x₂ there.
 """
 
 from __future__ import annotations
@@ -25,52 +17,18 @@ from typing import NamedTuple
 import numpy as np
 
 from dnnmso_mj import monitors
-from dnnmso_mj.command_filter import CommandFilter, build_filter, follow, start_filter
+from dnnmso_mj.backstepping import Law, act, build_law, held, observe
 from dnnmso_mj.compiling import copy, inner
 from dnnmso_mj.controllers import LEARNING, MODEL_ALONE, Command, CompiledTicks, Inputs
-from dnnmso_mj.inversion import solve_spd
 from dnnmso_mj.kernel import Net, forward, output_at
 from dnnmso_mj.learner import KernelLearner, build_learner
 from dnnmso_mj.monitors import Watch
-from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
-from dnnmso_mj.plant import Nominal, NominalModel, inertia
-from dnnmso_mj.scenario import Backstepping, Constant, expand
+from dnnmso_mj.observer import start
+from dnnmso_mj.plant import NominalModel
+from dnnmso_mj.scenario import Backstepping
 from dnnmso_mj.tick import closed_loop
 
 Array = np.ndarray
-
-
-class Errors(NamedTuple):
-    """The errors of the steps, of the last tick."""
-
-    w1: Array  # (n,) rad, compensated
-    w2: Array  # (n,) rad/s, compensated
-    z3: Array  # (n,) N·m; zero in two steps
-    xi1: Array  # (n,) rad, the compensation of this tick, and
-    xi2: Array  # (n,) rad/s
-    xi1_next: Array  # of the next
-    xi2_next: Array
-
-
-class Law(NamedTuple):
-    """The arrays of the law; without the network."""
-
-    observer: StateObserver
-    command: Command
-    errors: Errors
-    velocity: CommandFilter  # v_c
-    torque: CommandFilter  # τ_c
-    drift: Array  # (2n,) what the law takes for f: f̂ + K₂ e_a
-    gains: Array  # (3, n) K_q, K_v and K_τ (1/s)
-    B2_inv: Array  # (n, n) of the last tick
-    push: Array  # (n,) scratch
-    change: Array  # (n,) scratch
-    L: Array  # (n, n) scratch
-    fresh: Array  # (1,) int64: whether no tick was before
-    nominal: Nominal
-    constant: bool  # B₂ = b·I
-    feedforward: bool
-    lag: float  # s, see `build_law`; zero where two steps are all
 
 
 class Parts(NamedTuple):
@@ -81,38 +39,6 @@ class Parts(NamedTuple):
     watch: Watch
     command: Command
     known: int  # how many rows of f̂ are not learned
-
-
-def build_law(
-    spec: Backstepping, n: int, dt: float, nominal: Nominal, values: monitors.Monitors
-) -> Law:
-    """The law of a scenario for n joints.
-
-    N.B. the drives report the mean torque of the period before, half a period old, and what is
-    commanded acts half a period later in the mean: a change by the rate asked for takes T + dt.
-    """
-    observer = build_observer(spec.observer, 2 * n, dt)
-    tau, push, change = np.zeros((3, n))
-    Bu, x_hat, f_hat, drift = np.zeros((4, 2 * n))
-    b = spec.effectiveness.b if isinstance(spec.effectiveness, Constant) else 1.0
-    return Law(
-        observer=observer,
-        command=Command(tau, Bu, x_hat, f_hat, observer.e_obs, values),
-        errors=Errors(*np.zeros((7, n))),
-        velocity=build_filter(spec.filter_v, n, dt, ahead=False),
-        torque=build_filter(spec.filter_tau, n, dt, ahead=True),
-        drift=drift,
-        gains=np.array([expand(gain, n) for gain in (spec.K_q, spec.K_v, spec.K_tau)]),
-        B2_inv=np.eye(n) / b,
-        push=push,
-        change=change,
-        L=np.zeros((n, n)),
-        fresh=np.ones(1, np.int64),
-        nominal=nominal,
-        constant=isinstance(spec.effectiveness, Constant),
-        feedforward=spec.feedforward,
-        lag=0.0 if spec.actuator_lag is None else spec.actuator_lag + dt,
-    )
 
 
 class BacksteppingController:
@@ -143,11 +69,19 @@ class BacksteppingController:
         n_out = 2 * n - self._known
         self.learner = build_learner(spec.network, spec.rule, 2 * n, n_out, seed, watch=watch)
         self.n_layers = self.learner.shape.n_layers
-        self.law = build_law(spec, n, dt, nominal.view, self.learner.monitors)
+        self.law = build_law(spec, n, dt, nominal.view)
+        self.command = Command(
+            tau=self.law.tau,
+            Bu=self.law.Bu,
+            x_hat=np.zeros(2 * n),
+            f_hat=self.law.f_hat,
+            e_obs=self.law.observer.e_obs,
+            monitors=self.learner.monitors,
+        )
         self.ticks = None
         if isinstance(self.learner, KernelLearner):
             net, watching = self.learner.net, self.learner.watch
-            parts = Parts(self.law, net, watching, self.law.command, self._known)
+            parts = Parts(self.law, net, watching, self.command, self._known)
             self.ticks = CompiledTicks(run_ticks, parts, BacksteppingController.update)
 
     def reset(self, x: Array) -> None:
@@ -159,14 +93,15 @@ class BacksteppingController:
             update(self.ticks.parts, inputs)
         else:
             self._update_with_any_learner(inputs)
-        return self.law.command
+        return self.command
 
     def _update_with_any_learner(self, inputs: Inputs) -> None:
         """What `update` below compiles."""
         law, known = self.law, self._known
         observe(law, inputs)
-        law.command.f_hat[known:] += self.learner.predict(inputs.x)
-        act(law, inputs)
+        copy(law.observer.x_hat, self.command.x_hat)
+        law.f_hat[known:] += self.learner.predict(inputs.x)
+        act(law, inputs, inputs.frozen[0] != MODEL_ALONE)
         if inputs.frozen[0] == LEARNING:
             self.learner.learn(-law.observer.e_obs[known:])
 
@@ -174,31 +109,13 @@ class BacksteppingController:
         return self.learner.predict(x)[-x.size // 2 :].copy()
 
     def state(self) -> dict[str, Array]:
-        arrays = {name: array.copy() for name, array in _held(self.law).items()}
+        arrays = {name: array.copy() for name, array in held(self.law).items()}
         return {**arrays, **self.learner.state()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        for name, array in _held(self.law).items():
+        for name, array in held(self.law).items():
             array[:] = state[name]
         self.learner.restore(state)
-
-
-def _held(law: Law) -> dict[str, Array]:
-    """What the law keeps from one tick to the next, by name."""
-    return {
-        "x_hat": law.observer.x_hat,
-        "e_obs": law.observer.e_obs,
-        "f_hat": law.command.f_hat,
-        "tau": law.command.tau,
-        "B2_inv": law.B2_inv,
-        "velocity_command": law.velocity.value,
-        "velocity_slope": law.velocity.slope,
-        "torque_command": law.torque.value,
-        "torque_slope": law.torque.slope,
-        "xi1": law.errors.xi1_next,
-        "xi2": law.errors.xi2_next,
-        "fresh": law.fresh,
-    }
 
 
 @inner
@@ -206,106 +123,16 @@ def update(parts: Parts, inputs: Inputs) -> None:
     """One tick of the law above."""
     law, net, known = parts.law, parts.net, parts.known
     observe(law, inputs)
+    copy(law.observer.x_hat, parts.command.x_hat)
     output = forward(net, inputs.x)
     for i in range(output.size):
-        law.command.f_hat[known + i] += output[i]
-    act(law, inputs)
+        law.f_hat[known + i] += output[i]
+    act(law, inputs, inputs.frozen[0] != MODEL_ALONE)
     if inputs.frozen[0] == LEARNING:
         delta = output_at(net)
         for i in range(output.size):
             net.deltas[delta + i] = -law.observer.e_obs[known + i]
-        monitors.learn(net, parts.watch, law.command.monitors)
-
-
-@inner
-def observe(law: Law, inputs: Inputs) -> None:
-    """Bring X̂ to this tick with the torque that acted; f̂ = [x₂; 0], what no network is asked."""
-    command, x, n = law.command, inputs.x, inputs.tau.size
-    if law.fresh[0] == 0:
-        for i in range(n):
-            law.push[i] = inputs.tau[i] if law.observer.applied else command.tau[i]
-            command.Bu[i] = 0.0
-        solve_spd(law.B2_inv, law.push, command.Bu[n:], law.L)
-        advance(law.observer, command.f_hat, command.Bu)
-    compare(law.observer, x)
-    copy(law.observer.x_hat, command.x_hat)
-    if not law.constant:
-        inertia(law.nominal, x[:n])
-        for i in range(n):
-            copy(law.nominal.M[i], law.B2_inv[i])
-    for i in range(n):
-        command.f_hat[i], command.f_hat[n + i] = x[n + i], 0.0
-
-
-@inner
-def act(law: Law, inputs: Inputs) -> None:
-    """The steps of the law, once f̂ is complete."""
-    command, observer = law.command, law.observer
-    weight = 1.0 if law.feedforward and inputs.frozen[0] != MODEL_ALONE else 0.0
-    for i in range(law.drift.size):
-        law.drift[i] = command.f_hat[i] + weight * observer.gain[i] * observer.e_obs[i]
-    if law.fresh[0] == 1:
-        for i in range(inputs.tau.size):
-            law.errors.xi1_next[i] = law.errors.xi2_next[i] = 0.0
-    command_velocity(law, inputs)
-    command_torque(law)
-    if law.lag > 0.0:
-        lead_the_drives(law, inputs)
-    solve_spd(law.B2_inv, command.tau, command.Bu[command.tau.size :], law.L)
-    law.fresh[0] = 0
-
-
-@inner
-def command_velocity(law: Law, inputs: Inputs) -> None:
-    """Step 1: α₁ and v_c, and the compensated errors w₁ and w₂ of this tick."""
-    x, errors, n = inputs.x, law.errors, inputs.tau.size
-    for i in range(n):
-        K_q, e1 = law.gains[0, i], x[i] - inputs.x_ref[i]
-        errors.xi1[i], errors.xi2[i] = errors.xi1_next[i], errors.xi2_next[i]
-        alpha = inputs.xd_ref[i] - K_q * e1 - (law.drift[i] - x[n + i])
-        known = inputs.xd_ref[n + i] - K_q * (law.drift[i] - inputs.xd_ref[i])
-        if law.fresh[0] == 1:
-            start_filter(law.velocity, i, alpha)
-        v_c = law.velocity.value[i]
-        errors.w1[i] = e1 - errors.xi1[i]
-        errors.w2[i] = x[n + i] - v_c - errors.xi2[i]
-        compensation = -K_q * errors.xi1[i] + errors.xi2[i] + v_c - alpha
-        errors.xi1_next[i] += law.observer.dt * compensation
-        follow(law.velocity, i, alpha, known)
-
-
-@inner
-def command_torque(law: Law) -> None:
-    """Step 2: τ = α₂."""
-    tau, errors, n = law.command.tau, law.errors, law.push.size
-    for i in range(n):
-        z2 = errors.w2[i] + errors.xi2[i]
-        law.push[i] = law.velocity.rate[i] - law.drift[n + i]
-        law.push[i] -= law.gains[1, i] * z2 + errors.w1[i]
-    for i in range(n):
-        tau[i] = 0.0
-        for j in range(n):
-            tau[i] += law.B2_inv[i, j] * law.push[j]
-
-
-@inner
-def lead_the_drives(law: Law, inputs: Inputs) -> None:
-    """Step 3: what makes drives of a lag give α₂, in the place of it."""
-    tau, errors, torque, n = law.command.tau, law.errors, law.torque, law.push.size
-    for i in range(n):
-        if law.fresh[0] == 1:
-            start_filter(torque, i, tau[i])
-        errors.z3[i] = inputs.tau[i] - torque.value[i]
-        follow(torque, i, tau[i], 0.0)
-        law.push[i] = torque.value[i] - tau[i]
-    solve_spd(law.B2_inv, law.push, law.change, law.L)  # B₂ (τ_c − α₂)
-    for i in range(n):
-        compensation = -law.gains[1, i] * errors.xi2[i] + law.change[i]
-        errors.xi2_next[i] += law.observer.dt * compensation
-    solve_spd(law.B2_inv, errors.w2, law.change, law.L)  # B₂ is symmetric
-    for i in range(n):
-        rate = torque.rate[i] - law.change[i] - law.gains[2, i] * errors.z3[i]
-        tau[i] = inputs.tau[i] + law.lag * rate
+        monitors.learn(net, parts.watch, parts.command.monitors)
 
 
 run_ticks = closed_loop(update)

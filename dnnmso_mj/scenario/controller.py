@@ -114,7 +114,9 @@ class ClassicalMso(Strict):
         return chosen(self.optimizer, self.madam)
 
 
-Controller = Annotated[DnnMso | NoNetwork | ClassicalMso | Backstepping, Field(discriminator="kind")]
+Controller = Annotated[
+    DnnMso | NoNetwork | ClassicalMso | Backstepping, Field(discriminator="kind")
+]
 
 
 def inversion(controller: Controller) -> Inversion | None:
