@@ -86,7 +86,7 @@ def drive(
     lag: float = 0.0,
     watch: Callable[[int, Inputs, Array], None] = lambda k, inputs, tau: None,
 ) -> Run:
-    """Run a world with drives of a lag (s); `watch` is told inputs and what acts after each tick."""
+    """Run a world with drives of a lag (s); `watch` is told each tick and what acts."""
     inputs, drives, x = Inputs.zeros(2), Drives(lag), world.x0.copy()
     controller.reset(world.sense(x))
     rows: list[tuple[Array, ...]] = []
