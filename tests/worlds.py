@@ -35,8 +35,8 @@ class Run(NamedTuple):
     x: Array  # true, at the tick
 
     def rmse(self) -> float:
-        """Of the last half; infinite where the run ended early."""
-        return float(np.sqrt(np.mean(self.e[len(self.e) // 2 :] ** 2)))
+        """Of the last quarter; infinite where the run ended early."""
+        return float(np.sqrt(np.mean(self.e[3 * len(self.e) // 4 :] ** 2)))
 
     def chatter(self) -> float:
         """Mean change of the torque that acts from one tick to the next, in the last half."""

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import model_validator
 
 from dnnmso_mj.scenario.effectiveness import Effectiveness, Inertia
-from dnnmso_mj.scenario.fields import Positive, PositiveEach, Strict
+from dnnmso_mj.scenario.fields import Positive, PositiveEach, Strict, WeightScale
 from dnnmso_mj.scenario.learning import Network, Observer
 from dnnmso_mj.scenario.optimizers import ByMadam, Madam, Optimizer, Rule, check_resolvable, chosen
 
@@ -20,10 +20,15 @@ class ToldObserver(Observer):
 
 
 class KinematicNetwork(Network):
-    """The deep network of the dynamics, by default of the accelerations alone."""
+    """The deep network of the dynamics, by default of the accelerations alone, and small at first.
+
+    Both make a torque smoother, and what drives with a lag are commanded is its derivative.
+    """
 
     outputs: Literal["full", "kinematic"] = "kinematic"
     """full: the upper n rows of f̂ are q̇ and what is learned beside it. kinematic: q̇ alone."""
+    output_scale: WeightScale = 0.1
+    """Factor on the initial weights of the output layer."""
 
 
 class Backstepping(Strict):
@@ -35,7 +40,7 @@ class Backstepping(Strict):
     """Gain of the first step, on the angle's error (1/s): one number, or one for each joint."""
     K_v: PositiveEach = (7.5,)
     """Gain of the second step, on the velocity's error (1/s): one number, or one for each joint."""
-    K_tau: PositiveEach = (50.0,)
+    K_tau: PositiveEach = (25.0,)
     """Gain of the third step, on the torque's error (1/s): one number, or one for each joint."""
     filter_v: Positive = 50.0
     """Bandwidth of the velocity command's filter (rad/s)."""
