@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from dnnmso_mj.scenario.backstepping import Backstepping
 from dnnmso_mj.scenario.controller import effectiveness, inversion
 from dnnmso_mj.scenario.rivals import Rival
 
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from dnnmso_mj.scenario import Scenario
 
 MAX_TICKS = 100_000_000
+STEP_GAINS = ("K_q", "K_v", "K_tau", "filter_v", "filter_tau")
 
 Problem = tuple[str, str]
 
@@ -24,6 +26,7 @@ def contradictions(scenario: Scenario) -> list[Problem]:
         *_step_count(scenario),
         *_times_below_dt(scenario),
         *_observer_gain(scenario),
+        *_step_gains(scenario),
         *_stalls(scenario),
         *_events(scenario),
         *_sizes(scenario),
@@ -62,6 +65,16 @@ def _observer_gain(scenario: Scenario) -> Iterator[Problem]:
     if max(scenario.controller.observer.K2) >= most:
         problem = f"makes a sampled observer unstable; allowed: K2 < 2/dt = {most:g}"
         yield "controller.observer.K2", problem
+
+
+def _step_gains(scenario: Scenario) -> Iterator[Problem]:
+    controller, most = scenario.controller, 2.0 / scenario.dt
+    if controller.kind != "backstepping":
+        return
+    for name in STEP_GAINS:
+        if max(getattr(controller, name)) >= most:
+            problem = f"makes a sampled error unstable; allowed: {name} < 2/dt = {most:g}"
+            yield f"controller.{name}", problem
 
 
 def _stalls(scenario: Scenario) -> Iterator[Problem]:
@@ -131,10 +144,8 @@ def _controller_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, 
                 yield f"{path}.effectiveness.{name}", len(values), {n}
     if hasattr(controller, "observer"):
         yield "controller.observer.K2", len(controller.observer.K2), {1, 2 * n}
-    if isinstance(controller, Rival):  # each of its gains is of a joint
-        for name, value in controller:
-            if isinstance(value, tuple):
-                yield f"controller.{name}", len(value), {1, n}
+    if isinstance(controller, Rival | Backstepping):  # each of their gains is of a joint
+        yield from _numbers("controller", controller, n)
 
 
 def _reference_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:

@@ -1,13 +1,14 @@
-"""The network, its gradient and Madam's update, fused into compiled passes over flat arrays.
+"""The network, its gradient and its update, fused into compiled passes over flat arrays.
 
 `forward` leaves every layer's activations behind; `learn` walks back through them once and, while a
-weight is in hand, passes the error back through it and updates it. Nothing is allocated. The torch
-reference is `dnnmso_mj.network` with `dnnmso_mj.madam`.
+weight is in hand, passes the error back through it and updates it by Madam. For any other rule it
+takes the gradient first, and `dnnmso_mj.descent` updates. Nothing is allocated. The torch reference
+is `dnnmso_mj.network` with `dnnmso_mj.madam` and `dnnmso_mj.torch_optimizers`.
 
 A layer's weights are stored by input, those of one input to all neurons side by side, or by output,
 those of one neuron for all inputs (the constant one last), whichever takes less room when each row
 is padded with zeros to whole vector registers. A weight of zero under Madam stays zero, and padding
-of inputs and errors is zero, so it is inert.
+of inputs and errors is zero, so it is inert; so it is under the other rules, having no gradient.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.descent import ADAM, MADAM, SGD, SIGN_SGD, descend
 from dnnmso_mj.network import Activation, Shape
+from dnnmso_mj.scenario import Adam, Rule, Sgd
 from dnnmso_mj.scenario import Madam as MadamSpec
 
 Array = np.ndarray
@@ -50,35 +53,55 @@ class Net(NamedTuple):
 
     w: Array  # weights in the kernel's order
     v: Array  # their second moments ḡ²
+    m: Array  # their first moments; empty under Madam
+    g: Array  # their gradient; empty under Madam, which needs none as a vector
     acts: Array  # every layer's activations, the constant input behind each
     deltas: Array  # ∂loss/∂(input sum) of every layer; the last one is set by the caller
     layers: Array  # (L, 8) `Layer`s, int64
-    madam: Array  # η, η*, σ*, β; float64
+    rule: int  # MADAM, SGD, ADAM or SIGN_SGD
+    settings: Array  # (4,) of the rule; η, η*, σ*, β of Madam; float64
     updates: Array  # (1,) number of updates so far
     bias: int  # 1 with a constant input to every layer, else 0
     activation: int
     bias_correction: bool
 
 
-def build_net(shape: Shape, weights: Array, spec: MadamSpec) -> Net:
+def build_net(shape: Shape, weights: Array, spec: Rule) -> Net:
     """A network with the given flat weights (n_weights,), whose precision becomes its own."""
     dtype = weights.dtype
     layers = _layers(shape)
     n_acts = layers[-1].out + _padded(layers[-1].n_out) + LANES
+    rule, settings = _rule(spec)
+    n_moments = 0 if rule == MADAM else layers[-1].end
     net = Net(
         w=np.zeros(layers[-1].end, dtype),
         v=np.zeros(layers[-1].end, dtype),
+        m=np.zeros(n_moments, dtype),
+        g=np.zeros(n_moments, dtype),
         acts=np.zeros(n_acts, dtype),
         deltas=np.zeros(n_acts, dtype),
         layers=np.array(layers),
-        madam=np.array([spec.eta, spec.eta_max, spec.sigma_max, spec.beta]),
+        rule=rule,
+        settings=np.array(settings),
         updates=np.zeros(1, int),
         bias=int(shape.bias),
         activation=ACTIVATIONS[shape.activation],
-        bias_correction=spec.bias_correction,
+        bias_correction=isinstance(spec, MadamSpec) and spec.bias_correction,
     )
     net.w[:] = pack(shape, weights)
     return net
+
+
+def _rule(spec: Rule) -> tuple[int, tuple[float, float, float, float]]:
+    """A rule's number and settings."""
+    match spec:
+        case MadamSpec():
+            return MADAM, (spec.eta, spec.eta_max, spec.sigma_max, spec.beta)
+        case Sgd():
+            return SGD, (spec.eta, spec.momentum, 0.0, 0.0)
+        case Adam():
+            return ADAM, (spec.eta, spec.beta1, spec.beta2, spec.eps)
+    return SIGN_SGD, (spec.eta, 0.0, 0.0, 0.0)
 
 
 def _layers(shape: Shape) -> list[Layer]:
@@ -250,13 +273,23 @@ def _madam_row(
 
 @compiled
 def learn(net: Net) -> None:
-    """Back-propagate and update every weight once (Alg. 1), in place.
+    """Back-propagate and update every weight once, in place, by the network's rule.
 
     The activations are those of the last `forward`; the output's deltas hold ∂loss/∂f̂.
     """
-    real = net.w.dtype.type
-    eta, eta_max, sigma_max, beta = net.madam
     net.updates[0] += 1
+    if net.rule == MADAM:
+        _learn_by_madam(net)
+    else:
+        gradient(net, net.g)
+        descend(net.rule, net.settings, net.updates[0], net.w, net.g, net.m, net.v)
+
+
+@compiled
+def _learn_by_madam(net: Net) -> None:
+    """Alg. 1, in one pass."""
+    real = net.w.dtype.type
+    eta, eta_max, sigma_max, beta = net.settings
     correction = 1.0 - beta ** net.updates[0] if net.bias_correction else 1.0
     small = math.sqrt((1.0 - beta) / correction)
     fresh, forget, limit = real(math.sqrt(1.0 - beta)), real(beta), real(sigma_max)

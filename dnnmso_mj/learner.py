@@ -1,4 +1,4 @@
-"""A network that learns one sample a tick by Madam, called from Python.
+"""A network that learns one sample a tick, called from Python.
 
 Two backends with one interface: the compiled kernel, and torch's autograd (`torch_learner`) as the
 reference. A tick is `predict`, then `learn` with the gradient of the loss by the network's output.
@@ -16,8 +16,8 @@ from dnnmso_mj import kernel, monitors
 from dnnmso_mj.errors import NonFiniteError
 from dnnmso_mj.monitors import Monitors
 from dnnmso_mj.network import Shape, initial_weights, network_shape
-from dnnmso_mj.scenario import Madam as MadamSpec
 from dnnmso_mj.scenario import Network as NetworkSpec
+from dnnmso_mj.scenario import Rule
 
 Array = np.ndarray
 
@@ -32,21 +32,22 @@ class Learner(Protocol):
         """Output (n_out,) for input x (n_in,); overwritten by the next call."""
 
     def learn(self, delta: Array) -> None:
-        """One Madam update from ∂loss/∂output (n_out,) at the last predicted input."""
+        """One update from ∂loss/∂output (n_out,) at the last predicted input."""
 
     def state(self) -> dict[str, Array]:
-        """Weights, second moments, number of updates and monitors held: all that comes after."""
+        """Weights, moments, number of updates and monitors held: all that comes after."""
 
     def restore(self, state: Mapping[str, Array]) -> None:
         """Go on from a `state`."""
 
 
 def build_learner(
-    network: NetworkSpec, madam: MadamSpec, n_in: int, n_out: int, seed: int, *, watch: bool = True
+    network: NetworkSpec, rule: Rule, n_in: int, n_out: int, seed: int, *, watch: bool = True
 ) -> Learner:
     """The learner that a scenario asks for; the same seed gives both backends the same weights.
 
     Args:
+        rule: what updates the weights: the settings of Madam or of another.
         watch: whether the monitors are kept; they change nothing in what is learned.
     """
     shape = network_shape(network, n_in, n_out)
@@ -55,8 +56,8 @@ def build_learner(
     if network.backend == "torch":
         from dnnmso_mj.torch_learner import TorchLearner
 
-        return TorchLearner(shape, weights, madam)
-    return KernelLearner(shape, weights, madam, watch=watch)
+        return TorchLearner(shape, weights, rule)
+    return KernelLearner(shape, weights, rule, watch=watch)
 
 
 class KernelLearner:
@@ -66,13 +67,11 @@ class KernelLearner:
         shape: layer sizes.
         weights: flat initial weights (n_weights,), float64 or float32, which is the precision that
             the network learns in; copied.
-        spec: Madam's parameters.
+        spec: the rule that updates the weights.
         watch: whether the monitors are kept.
     """
 
-    def __init__(
-        self, shape: Shape, weights: Array, spec: MadamSpec, *, watch: bool = True
-    ) -> None:
+    def __init__(self, shape: Shape, weights: Array, spec: Rule, *, watch: bool = True) -> None:
         self.shape = shape
         self.net = kernel.build_net(shape, weights, spec)
         self.watch = monitors.build_watch(self.net, spec, watch)
@@ -95,6 +94,7 @@ class KernelLearner:
         return {
             "weights": kernel.unpack(self.shape, self.net.w),
             "second_moment": kernel.unpack(self.shape, self.net.v),
+            **({"first_moment": kernel.unpack(self.shape, self.net.m)} if self.net.m.size else {}),
             "updates": self.net.updates.copy(),
             **held(self.monitors),
         }
@@ -102,6 +102,8 @@ class KernelLearner:
     def restore(self, state: Mapping[str, Array]) -> None:
         self.net.w[:] = kernel.pack(self.shape, state["weights"])
         self.net.v[:] = kernel.pack(self.shape, state["second_moment"])
+        if self.net.m.size:
+            self.net.m[:] = kernel.pack(self.shape, state["first_moment"])
         self.net.updates[:] = state["updates"]
         hold(self.monitors, state)
 

@@ -6,8 +6,8 @@ cell, the one that was not visited for longest is given up.
 
 A trajectory is a curve, and on a curve q and q̇ go together: nothing there tells a network which of
 the two the dynamics depend on, and what it makes up can undo the damping of the feedback. So a
-remembered state is replayed with a small displacement, and the same label: the model is held flat in
-all directions that the labels do not speak of (training with noise is Tikhonov regularisation:
+remembered state is replayed with a small displacement and the same label: the model is held flat
+in all directions that the labels do not speak of (training with noise is Tikhonov regularisation:
 Bishop 1995). Entries and displacements go by an additive recurrence of low discrepancy (Roberts
 2018), which needs no random numbers.
 """
@@ -106,7 +106,7 @@ def _cell(x: Array, spacing: float) -> int:
     """A hash of the cell of x: two cells may share one, and then they share their place."""
     code = 0
     for value in x:
-        code = code * 1_000_003 + int(math.floor(value / spacing))
+        code = code * 1_000_003 + math.floor(value / spacing)
     return code
 
 

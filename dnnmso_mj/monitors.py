@@ -2,8 +2,8 @@
 
 Watching needs the gradient as a vector and a second backward pass, more work than the update
 itself, and changes nothing: the trajectory is the same with and without. Between two looks
-the last values are held. Every update that may be clamped is looked at: |g/ḡ|, at most 1/√(1 − β),
-would have to exceed η*/η, or a weight to be near σ*.
+the last values are held. Every update that Madam may clamp is looked at: |g/ḡ|, at most 1/√(1 − β),
+would have to exceed η*/η, or a weight to be near σ*. No other rule clamps.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ import numpy as np
 
 from dnnmso_mj import kernel
 from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.descent import MADAM
 from dnnmso_mj.kernel import END, START, Net
 from dnnmso_mj.scenario import Madam as MadamSpec
+from dnnmso_mj.scenario import Rule
 from dnnmso_mj.theory import CLIPPED, DW_SQ, G_SQ, GW, W_SQ, layer_monitors
 
 Array = np.ndarray
@@ -51,15 +53,17 @@ class Watch(NamedTuple):
     never: bool
 
 
-def build_watch(net: Net, spec: MadamSpec, on: bool) -> Watch:
+def build_watch(net: Net, spec: Rule, on: bool) -> Watch:
     """What `learn` needs to watch a network, or to leave it alone."""
     w, g, g_after = np.zeros((3, net.w.size), net.w.dtype)
     stats = np.zeros((len(net.layers), 5))
     return Watch(w, g, g_after, stats, clamp_norm=clamp_norm(spec), never=not on)
 
 
-def clamp_norm(spec: MadamSpec) -> float:
+def clamp_norm(spec: Rule) -> float:
     """‖W_l‖ above which an update may be clamped before the next sample; −1 where each may be."""
+    if not isinstance(spec, MadamSpec):
+        return math.inf
     if spec.eta_max < 1.001 * spec.eta / math.sqrt(1.0 - spec.beta):  # room for rounding
         return -1.0
     return spec.sigma_max * math.exp(-(WATCH_EVERY + 1) * spec.eta_max)
@@ -104,13 +108,23 @@ def _span(net: Net, layer: int) -> slice:
 @inner
 def _sum_up(net: Net, watch: Watch) -> None:
     """Σw², Σg², Σ|g||w|, ΣΔw² and the number of clamped updates of each layer into `stats`."""
-    eta, eta_max, sigma_max, beta = net.madam
+    for layer in range(len(net.layers)):
+        span = _span(net, layer)
+        _sum_layer(watch.w[span], watch.g[span], net.w[span], watch.stats[layer])
+    if net.rule == MADAM:
+        _count_clamps(net, watch)
+
+
+@inner
+def _count_clamps(net: Net, watch: Watch) -> None:
+    """The number of clamped updates of each layer into `stats`."""
+    eta, eta_max, sigma_max, beta = net.settings
     correction = 1.0 - beta ** net.updates[0] if net.bias_correction else 1.0
     most_sq = (eta_max / eta) ** 2 / correction
     for layer in range(len(net.layers)):
-        span, sums = _span(net, layer), watch.stats[layer]
-        _sum_layer(watch.w[span], watch.g[span], net.w[span], sums)
-        sums[CLIPPED] = _count_clamped(watch.g[span], net.w[span], net.v[span], most_sq, sigma_max)
+        span = _span(net, layer)
+        clamped = _count_clamped(watch.g[span], net.w[span], net.v[span], most_sq, sigma_max)
+        watch.stats[layer, CLIPPED] = clamped
 
 
 @compiled

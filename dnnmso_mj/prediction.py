@@ -1,8 +1,8 @@
 """The state that a torque commanded now will meet, when it comes late by a known delay.
 
-At tick k the sensors show the state of tick k − d_s, and the command acts from tick k + d_a on. What
-acts in the D = d_s + d_a periods between is known: the drives report it, or it is on its way. So the
-model is integrated over them,
+At tick k the sensors show the state of tick k − d_s, and the command acts from tick k + d_a on.
+What acts in the D = d_s + d_a periods between is known: the drives report it, or it is on its way.
+So the model is integrated over them,
 
     q̈ = f̂(x) + d̂ + B₂(q) τ,    d̂ held,
 

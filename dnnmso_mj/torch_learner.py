@@ -12,6 +12,7 @@ from dnnmso_mj.learner import held, hold
 from dnnmso_mj.monitors import WATCH_EVERY, Monitors, clamp_norm, is_due
 from dnnmso_mj.network import Shape, TorchNetwork
 from dnnmso_mj.scenario import Madam as MadamSpec
+from dnnmso_mj.scenario import Rule
 from dnnmso_mj.theory import DW_SQ, G_SQ, GW, W_SQ, layer_monitors
 
 Array = np.ndarray
@@ -25,10 +26,10 @@ class TorchLearner:
     Args:
         shape: layer sizes.
         weights: flat initial weights (n_weights,), whose precision it learns in; copied.
-        spec: Madam's parameters.
+        spec: the rule that updates the weights.
     """
 
-    def __init__(self, shape: Shape, weights: Array, spec: MadamSpec) -> None:
+    def __init__(self, shape: Shape, weights: Array, spec: Rule) -> None:
         try:
             import torch
         except ImportError as error:
@@ -36,13 +37,13 @@ class TorchLearner:
                 "controller.network.backend = torch needs torch, which is not installed; "
                 "pip install 'dnnmso_mj[reference]', or use backend: kernel"
             ) from error
-        from dnnmso_mj.madam import Madam
+        from dnnmso_mj import torch_optimizers
 
-        self._torch = torch
+        self._torch, self._rules = torch, torch_optimizers
         self.shape, self.spec = shape, spec
         self.monitors = Monitors.zeros(shape.n_layers)
         self.network = TorchNetwork(shape, weights)
-        self.optimizer = Madam(self.network.parameters, spec)
+        self.optimizer = torch_optimizers.build_optimizer(self.network.parameters, spec)
         self._dtype = self.network.parameters[0].dtype
         self._x = torch.zeros(shape.sizes[0], dtype=self._dtype)
         self._output = self._x
@@ -80,14 +81,27 @@ class TorchLearner:
     def _sums(self, w: Array, g: Array) -> Array:
         """Σw², Σg², Σ|g||w|, ΣΔw² and clamped updates, (L, 5)."""
         w, g, new = w.astype(float), g.astype(float), self.network.flat().astype(float)
-        second_moments = [self.optimizer.state[W]["g_bar_sq"] for W in self.network.parameters]
-        v = np.concatenate([moment.numpy().ravel() for moment in second_moments])
-        beta, most = self.spec.beta, self.spec.eta_max / self.spec.eta
-        correction = 1 - beta ** (self._updates + 1) if self.spec.bias_correction else 1.0
-        clipped = (g * g > most**2 / correction * v) | (np.abs(new) >= self.spec.sigma_max)
-        columns = [w * w, g * g, np.abs(g * w), (new - w) ** 2, clipped.astype(float)]
+        clipped = self._clamped(g, new).astype(float)
+        columns = [w * w, g * g, np.abs(g * w), (new - w) ** 2, clipped]
         layers = zip(*(self.shape.split(column) for column in columns), strict=True)
         return np.array([[matrix.sum() for matrix in layer] for layer in layers])
+
+    def _clamped(self, g: Array, new: Array) -> Array:
+        """Whether Madam has clamped a ratio or a weight; no other rule does."""
+        spec = self.spec
+        if not isinstance(spec, MadamSpec):
+            return np.zeros(g.size, bool)
+        most = spec.eta_max / spec.eta
+        correction = 1 - spec.beta ** (self._updates + 1) if spec.bias_correction else 1.0
+        bold = g * g > most**2 / correction * self._moments(self._rules.SECOND_MOMENT)
+        clamped: Array = bold | (np.abs(new) >= spec.sigma_max)
+        return clamped
+
+    def _moments(self, names: Mapping[type[Rule], str]) -> Array:
+        """The first or second moments, flat (n_weights,)."""
+        name = names.get(type(self.spec))
+        moments = [self._rules.moment(self.optimizer, name, W) for W in self.network.parameters]
+        return np.concatenate([m.detach().numpy().ravel() for m in moments])
 
     def _check(self, sums: Array) -> None:
         if not math.isfinite(sums.sum()):
@@ -95,26 +109,23 @@ class TorchLearner:
             raise NonFiniteError(f"{NAMES[column]} of layer {layer + 1}", sums[layer, column])
 
     def state(self) -> dict[str, Array]:
-        moments = [
-            self.optimizer.state[W].get("g_bar_sq", self._torch.zeros_like(W))
-            for W in self.network.parameters
-        ]
         return {
             "weights": self.network.flat(),
-            "second_moment": np.concatenate([m.detach().numpy().ravel() for m in moments]),
+            "second_moment": self._moments(self._rules.SECOND_MOMENT),
+            "first_moment": self._moments(self._rules.FIRST_MOMENT),
             "updates": np.array([self._updates]),
             **held(self.monitors),
         }
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        weights = self.shape.split(state["weights"])
-        moments = self.shape.split(state["second_moment"])
+        names = ("weights", "first_moment", "second_moment")
+        layers = zip(*(self.shape.split(state[name]) for name in names), strict=True)
         self._updates = int(state["updates"][0])
         with self._torch.no_grad():
-            for W, value, moment in zip(self.network.parameters, weights, moments, strict=True):
-                W.copy_(self._torch.tensor(value))
-                g_bar_sq = self._torch.tensor(moment)
-                self.optimizer.state[W].update(k=self._updates, g_bar_sq=g_bar_sq)
+            for W, values in zip(self.network.parameters, layers, strict=True):
+                weights, first, second = (self._torch.tensor(value) for value in values)
+                W.copy_(weights)
+                self._rules.put_back(self.optimizer, self.spec, W, self._updates, first, second)
         hold(self.monitors, state)
 
 

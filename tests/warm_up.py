@@ -21,6 +21,7 @@ def main() -> None:
     for name, sets in (
         ("paper", []),
         ("paper", [double]),
+        ("paper", ["controller.kind=backstepping"]),
         ("paper_no_network", []),
         ("classical_mso", []),
         ("classical_mso", [double]),

@@ -11,6 +11,7 @@ from dnnmso_mj.inversion import DynamicInversion
 from dnnmso_mj.monitors import Monitors
 from dnnmso_mj.plant import Mjcf, NominalModel
 from dnnmso_mj.scenario import (
+    Backstepping,
     ClassicalMso,
     ConcurrentLearning,
     DnnMso,
@@ -126,6 +127,7 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
         mjcf: the model that it names.
         watch: whether the monitors of the network are kept; they change nothing else.
     """
+    from dnnmso_mj.controllers.backstepping import BacksteppingController
     from dnnmso_mj.controllers.classical_mso import ClassicalMsoController
     from dnnmso_mj.controllers.concurrent_learning import ConcurrentLearningController
     from dnnmso_mj.controllers.dnn_mso import DnnMsoController
@@ -138,16 +140,16 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
     spec, n, dt = scenario.controller, scenario.n_joints, scenario.dt
     if isinstance(spec, Rival):
         return build_rival(spec, n, dt, nominal)
-    match spec:
-        case DnnMso():
-            return DnnMsoController(spec, n, dt, scenario.seed, nominal, watch=watch)
-        case DnnMsoReplay():
-            return DnnMsoReplayController(spec, n, dt, scenario.seed, nominal, watch=watch)
-        case NoNetwork():
-            return NoNetworkController(spec, n, dt, nominal)
-        case ClassicalMso():
-            return ClassicalMsoController(spec, n, dt, scenario.seed, nominal, watch=watch)
-        case SlotineLi():
-            return SlotineLiController(spec, dt, nominal)
-        case ConcurrentLearning():
-            return ConcurrentLearningController(spec, dt, nominal)
+    if isinstance(spec, NoNetwork):
+        return NoNetworkController(spec, n, dt, nominal)
+    if isinstance(spec, SlotineLi):
+        return SlotineLiController(spec, dt, nominal)
+    if isinstance(spec, ConcurrentLearning):
+        return ConcurrentLearningController(spec, dt, nominal)
+    with_network: dict[type, Callable[..., Controller]] = {
+        DnnMso: DnnMsoController,
+        DnnMsoReplay: DnnMsoReplayController,
+        ClassicalMso: ClassicalMsoController,
+        Backstepping: BacksteppingController,
+    }
+    return with_network[type(spec)](spec, n, dt, scenario.seed, nominal, watch=watch)

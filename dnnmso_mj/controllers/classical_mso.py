@@ -59,7 +59,7 @@ class ClassicalMsoController:
     """MSO with known dynamics and a learned matched uncertainty.
 
     Args:
-        spec: gains, network and Madam of the scenario.
+        spec: gains, network and learning rule of the scenario.
         n_joints: n.
         dt: control period (s).
         seed: of the initial weights.
@@ -78,7 +78,7 @@ class ClassicalMsoController:
         watch: bool = True,
     ) -> None:
         n = n_joints
-        self.learner = build_learner(spec.network, spec.madam, 2 * n, n, seed, watch=watch)
+        self.learner = build_learner(spec.network, spec.rule, 2 * n, n, seed, watch=watch)
         self.n_layers = self.learner.shape.n_layers
         self._nominal = nominal  # keeps alive what compiled code knows by address
         inversion = build_inversion(spec.inversion, n, nominal.view)

@@ -44,7 +44,7 @@ class DnnMsoController:
     """DNN-MSO with dynamic inversion.
 
     Args:
-        spec: gains, network and Madam of the scenario.
+        spec: gains, network and learning rule of the scenario.
         n_joints: n.
         dt: control period (s).
         seed: of the initial weights.
@@ -68,7 +68,7 @@ class DnnMsoController:
         self.inversion = build_inversion(spec.inversion, n, nominal.view)
         self.observer = build_observer(spec.observer, 2 * n, dt)
         n_out = 2 * n - self._known
-        self.learner = build_learner(spec.network, spec.madam, 2 * n, n_out, seed, watch=watch)
+        self.learner = build_learner(spec.network, spec.rule, 2 * n, n_out, seed, watch=watch)
         self.n_layers = self.learner.shape.n_layers
         self.command = command_of(self.inversion, self.observer.e_obs, self.learner.monitors)
         self.ticks = None

@@ -41,7 +41,7 @@ from dnnmso_mj.controllers import (
 from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert, solve_spd
 from dnnmso_mj.kernel import Net, forward, output_at
 from dnnmso_mj.kernel import learn as learn_once
-from dnnmso_mj.learner import KernelLearner, build_learner
+from dnnmso_mj.learner import KernelLearner
 from dnnmso_mj.memory import (
     SIZE,
     Memory,
@@ -52,6 +52,7 @@ from dnnmso_mj.memory import (
     restore_memory,
 )
 from dnnmso_mj.monitors import Watch
+from dnnmso_mj.network import initial_weights, network_shape
 from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
 from dnnmso_mj.plant import NominalModel, inertia
 from dnnmso_mj.prediction import Predictor, build_predictor, predict, report
@@ -60,7 +61,7 @@ from dnnmso_mj.tick import closed_loop
 
 Array = np.ndarray
 
-ETA = 0  # the slot of `Net.madam`
+ETA = 0  # the slot of `Net.settings`
 
 
 class Law(NamedTuple):
@@ -131,8 +132,10 @@ class DnnMsoReplayController:
     ) -> None:
         n, replay, rate = n_joints, spec.replay, spec.rate
         self._nominal = nominal  # keeps alive what compiled code knows by address
-        learner = build_learner(spec.network, spec.madam, 2 * n, n, seed, watch=watch)
-        assert isinstance(learner, KernelLearner)
+        shape = network_shape(spec.network, 2 * n, n)
+        weights = initial_weights(shape, spec.network, np.random.default_rng(seed))
+        weights = weights.astype(spec.network.precision)
+        learner = KernelLearner(shape, weights, spec.madam, watch=watch)
         self.learner = learner
         self.n_layers = learner.shape.n_layers
         inversion = build_inversion(spec.inversion, n, nominal.view)
@@ -308,12 +311,12 @@ def learn(parts: Parts, inputs: Inputs) -> None:
         implied = observer.gain[n + i] * observer.e_obs[n + i]
         net.deltas[delta + i] = output[i] - parts.command.f_hat[n + i] - implied
         law.label[i] = law.f_lagged[i] + implied
-    net.madam[ETA] = eta
+    net.settings[ETA] = eta
     monitors.learn(net, parts.watch, parts.command.monitors)
     if law.ticks[0] % law.every == 0 and turning < law.error**2:
         remember(memory, law.x_lagged, law.label)
     share = min(1.0, law.replay_sq[0] / law.replay_error**2)
-    net.madam[ETA] = law.eta_min + (law.eta_replay - law.eta_min) * share
+    net.settings[ETA] = law.eta_min + (law.eta_replay - law.eta_min) * share
     if memory.counts[SIZE] > 0:
         for _ in range(law.samples):
             entry = recall(memory)

@@ -25,7 +25,7 @@ from dnnmso_mj.figures.drawing import (
     subscript,
 )
 from dnnmso_mj.metrics import worst_error
-from dnnmso_mj.scenario import ClassicalMso, DnnMso
+from dnnmso_mj.scenario import Madam
 from dnnmso_mj.scenario.controller import inversion as inversion_of
 from dnnmso_mj.trace import Array, Trace
 
@@ -88,9 +88,9 @@ def _update_ratios(ax: Axes, trace: Trace) -> None:
 
 def _theorem_1(ax: Axes, trace: Trace) -> None:
     _layers(ax, trace["t"], trace["eta_bound"], log_line)
-    controller = trace.scenario.controller
-    if isinstance(controller, DnnMso | ClassicalMso):
-        ax.axhline(controller.madam.eta, color=INK, label="η used", **DASHED)
+    rule = getattr(trace.scenario.controller, "rule", None)
+    if isinstance(rule, Madam):
+        ax.axhline(rule.eta, color=INK, label="η used", **DASHED)
     _name(ax, trace, "Theorem 1", "bound on η (–)")
 
 

@@ -13,18 +13,8 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from dnnmso_mj.consistency import contradictions, entries
 from dnnmso_mj.scenario.adaptive import ConcurrentLearning, SlotineLi
-from dnnmso_mj.scenario.controller import (
-    ClassicalMso,
-    Controller,
-    DnnMso,
-    DnnMsoReplay,
-    Inversion,
-    KnownDelay,
-    Madam,
-    Network,
-    NoNetwork,
-    Observer,
-)
+from dnnmso_mj.scenario.backstepping import Backstepping
+from dnnmso_mj.scenario.controller import ClassicalMso, Controller, DnnMso, NoNetwork
 from dnnmso_mj.scenario.effectiveness import Constant, Effectiveness, Inertia
 from dnnmso_mj.scenario.events import Event, Freeze, Payload, Push
 from dnnmso_mj.scenario.fields import (
@@ -39,12 +29,19 @@ from dnnmso_mj.scenario.fields import (
     refusal,
 )
 from dnnmso_mj.scenario.imperfections import Friction, Imperfections
+from dnnmso_mj.scenario.inversion import Inversion
+from dnnmso_mj.scenario.learning import Network, Observer
+from dnnmso_mj.scenario.optimizers import Adam, ByMadam, Madam, Rule, Sgd, SignSgd
+from dnnmso_mj.scenario.replay import DnnMsoReplay, KnownDelay
 from dnnmso_mj.scenario.rivals import L1, Adrc, ComputedTorque, Pd, Pid, Rise, SlidingMode
 
 __all__ = [
     "L1",
     "PAPER_MODEL",
+    "Adam",
     "Adrc",
+    "Backstepping",
+    "ByMadam",
     "ClassicalMso",
     "ComputedTorque",
     "ConcurrentLearning",
@@ -74,8 +71,11 @@ __all__ = [
     "RealTime",
     "Reference",
     "Rise",
+    "Rule",
     "Scenario",
     "Setpoint",
+    "Sgd",
+    "SignSgd",
     "Sinusoid",
     "SlidingMode",
     "SlotineLi",

@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from dnnmso_mj.scenario import ClassicalMso, DnnMso, expand
+from dnnmso_mj.scenario import ClassicalMso, DnnMso, Madam, expand
 from dnnmso_mj.trace import Array, Trace
 
 Rgb = tuple[int, int, int]
@@ -142,7 +142,7 @@ def _learned_row(trace: Trace, row: int) -> Plot:
 def _network_theory(trace: Trace) -> list[Plot]:
     controller = trace.scenario.controller
     eta: tuple[Level, ...] = ()
-    if isinstance(controller, DnnMso | ClassicalMso):
+    if isinstance(controller, DnnMso | ClassicalMso) and isinstance(controller.rule, Madam):
         eta = (Level("η in use", controller.madam.eta, WHITE),)
     trust = (
         Line("deep relative trust", _log10(trace["drt_bound"]), WHITE, BROAD),
