@@ -251,13 +251,28 @@ def _point(
     texts = [item.text for item in values]
     with _typed_as_grid(texts):
         scenario = load_scenario(source, [*sets, *texts])
+    return ready_point(scenario, (*parse_overrides(sets), *values), models)
+
+
+def ready_point(
+    scenario: Scenario, overrides: Sequence[Override], models: dict[str, Mjcf]
+) -> Point:
+    """A point of a plan, checked down to its first tick.
+
+    Args:
+        scenario: what `overrides` made.
+        overrides: the point's parameters.
+        models: those read before, by name; a new one is added.
+
+    Raises:
+        ScenarioError: the model cannot be used, or does not fit the scenario.
+    """
     name = scenario.plant.model
     if name not in models:
         models[name] = Mjcf.read(find_model(name))
     # One tick refuses what the model refuses, and compiles once what every worker then loads.
     simulate(scenario.model_copy(update={"duration": scenario.dt}), models[name], watch=False)
     resolved = scenario.model_dump(mode="json")
-    overrides = (*parse_overrides(sets), *values)
     parameters = {".".join(item.path): _typed(item, resolved) for item in overrides}
     return Point(parameters, scenario, models[name])
 
@@ -266,6 +281,8 @@ def _typed(override: Override, resolved: Any) -> Any:
     """The value that was set, a whole number as a float where the scenario has floats."""
     value, there = override.value, resolved
     for key in override.path:
+        if isinstance(there, dict) and key not in there:
+            return value  # controller.from is gone when it has done its work
         there = there[int(key)] if isinstance(there, list) else there[key]
     if isinstance(there, list) and there and not isinstance(value, list):
         there = there[0]  # one number for all joints
