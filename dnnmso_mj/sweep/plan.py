@@ -122,8 +122,8 @@ def plan_sweep(
         SweepError: seeds, or keys that are set twice.
     """
     axes = [_axis(text) for text in grid]
-    _check_keys(parse_overrides(sets), axes)
-    ordered = _ordered(seeds)
+    check_keys(parse_overrides(sets), axes)
+    ordered = ordered_seeds(seeds)
     models: dict[str, Mjcf] = {}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -155,7 +155,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             allowed = f"allowed: at most {MAX_SEEDS}; split a larger sweep by seeds"
             raise SweepError(f"--seeds {clean(text)}: too many; {allowed}")
         seeds += range(start, stop)
-    return _ordered(seeds)
+    return ordered_seeds(seeds)
 
 
 def seeds_text(seeds: Sequence[int]) -> str:
@@ -168,7 +168,12 @@ def seeds_text(seeds: Sequence[int]) -> str:
     return ",".join(pieces)
 
 
-def _ordered(seeds: Iterable[int]) -> tuple[int, ...]:
+def ordered_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
+    """Seeds in ascending order.
+
+    Raises:
+        SweepError: none, one twice, or one out of range.
+    """
     ordered = sorted(seeds)
     if not ordered:
         raise SweepError("seeds: none; allowed: at least one")
@@ -220,8 +225,12 @@ def _split(text: str) -> list[str]:
     return [*pieces, text[start:]]
 
 
-def _check_keys(sets: Sequence[Override], axes: Sequence[tuple[Override, ...]]) -> None:
-    """Refuse a key that has two values, and a seed that `--seeds` would override."""
+def check_keys(sets: Sequence[Override], axes: Sequence[tuple[Override, ...]] = ()) -> None:
+    """Refuse a key that has two values, and a seed that `--seeds` would override.
+
+    Raises:
+        SweepError: such a key.
+    """
     grid = [axis[0].path for axis in axes]
     paths = [*(item.path for item in sets), *grid]
     if ("seed",) in paths:
