@@ -53,6 +53,7 @@ def tune(
 ) -> None:
     """Search for a controller's best settings; the winner is a file for `controller: {from: …}`."""
     from dnnmso_mj.sweep.plan import parse_seeds
+    from dnnmso_mj.tuning import TuneInterrupted
     from dnnmso_mj.tuning.objective import Objective
     from dnnmso_mj.tuning.run import Request, default_storage
     from dnnmso_mj.tuning.run import tune as search
@@ -74,9 +75,9 @@ def tune(
                 done = search(
                     request, out, where, jobs=jobs, resume=resume, force=force, watcher=watch
                 )
-        except KeyboardInterrupt as stop:
+        except TuneInterrupted as stop:
             watch.stop()
-            raise KeyboardInterrupt(how_to_go_on(watch.done, trials, where, "trials")) from stop
+            raise KeyboardInterrupt(how_to_go_on(stop.done, trials, where, "trials")) from stop
     if as_json:
         print(json.dumps(_document(done, request), allow_nan=False))
     else:
@@ -89,15 +90,13 @@ class _Watch:
 
     name: str
     bar: Progress | None
-    done: int = 0
 
     def begin(self, total: int, kept: int) -> None:
-        self.done, self._total, self._said = kept, total, time.monotonic()
+        self._total, self._said = total, time.monotonic()
         if self.bar is not None:
             self._task = self.bar.add_task("", total=total, completed=kept, text=self.name)
 
     def trial(self, done: int, value: float, best: float) -> None:
-        self.done = done
         text = f"{self.name}: {done}/{self._total} trials, best {best:.4g}, last {value:.4g}"
         if self.bar is not None:
             self.bar.update(self._task, completed=done, text=text)

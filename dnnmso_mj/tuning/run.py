@@ -29,7 +29,7 @@ from dnnmso_mj.sweep.plan import (
     seeds_text,
 )
 from dnnmso_mj.sweep.task import Row, Task
-from dnnmso_mj.tuning import TuneError
+from dnnmso_mj.tuning import TuneError, TuneInterrupted
 from dnnmso_mj.tuning.objective import Objective
 from dnnmso_mj.tuning.spaces import SPACES, Range, Space
 from dnnmso_mj.tuning.study import Study, Values
@@ -116,8 +116,8 @@ def tune(
 ) -> Tuned:
     """Search, and write the best controller to `out`.
 
-    An exception on the way, Ctrl-C too, leaves every finished trial in `storage` for `resume`,
-    which comes to the same controller as a search without interruption.
+    An exception on the way leaves every finished trial in `storage` for `resume`, which comes to
+    the same controller as a search without interruption.
 
     Args:
         request: what for.
@@ -132,6 +132,7 @@ def tune(
         MissingExtraError: Optuna is not installed.
         ScenarioError: as `load_scenario`.
         TuneError: what is asked for cannot be tuned, or a file is taken or of another tuning.
+        TuneInterrupted: Ctrl-C.
     """
     _check(request, resume, force)
     check_out(out, replace=resume or force)
@@ -159,8 +160,11 @@ def tune(
             )
         if watcher is not None:
             watcher.begin(request.trials, kept)
-        while study.n_done < request.trials:
-            _one_trial(study, search, pool, watcher)
+        try:
+            while study.n_done < request.trials:
+                _one_trial(study, search, pool, watcher)
+        except KeyboardInterrupt as stop:
+            raise TuneInterrupted(study.n_done) from stop
         best, parameters, value = study.best
         start_value = study.values()[0]
         tested = [
