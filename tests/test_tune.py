@@ -25,7 +25,8 @@ from dnnmso_mj.sweep.plan import plan_sweep
 from dnnmso_mj.sweep.task import Task, run_task
 from dnnmso_mj.tuning import TuneError, TuneInterrupted
 from dnnmso_mj.tuning.objective import LOST, OVER_LIMIT, Objective
-from dnnmso_mj.tuning.run import Request, Tuned, default_storage, tune
+from dnnmso_mj.tuning.run import Tuned, default_storage, tune
+from dnnmso_mj.tuning.search import Request
 from dnnmso_mj.tuning.spaces import SPACES
 
 SETS = ("duration=0.2",)

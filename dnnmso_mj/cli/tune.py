@@ -14,17 +14,28 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dnnmso_mj.cli.shared import Json, Overrides, near, number, print_table
+from dnnmso_mj.cli.shared import (
+    Force,
+    Jobs,
+    Json,
+    Overrides,
+    Resume,
+    ScenarioName,
+    near,
+    number,
+    print_table,
+)
 from dnnmso_mj.cli.watching import LINE_PERIOD, how_to_go_on, terminated_like_ctrl_c
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from dnnmso_mj.tuning.run import Request, Tuned
+    from dnnmso_mj.tuning.run import Tuned
+    from dnnmso_mj.tuning.search import Request
 
 
 def tune(
-    scenario: Annotated[str, typer.Argument(help="A scenario file, or the name of a shipped one.")],
+    scenario: ScenarioName,
     controller: Annotated[
         str,
         typer.Option(metavar="KIND_OR_FILE", help="What is tuned, and where the search starts."),
@@ -44,19 +55,18 @@ def tune(
         float | None, typer.Option(help="Limit of tau_chatter (N·m a step).")
     ] = None,
     storage: Annotated[Path | None, typer.Option(help="Default OUT.study.sqlite.")] = None,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Runs at once; default all cores.")
-    ] = None,
-    resume: Annotated[bool, typer.Option(help="Go on with the study that is there.")] = False,
-    force: Annotated[bool, typer.Option(help="Start anew whatever is there.")] = False,
+    jobs: Jobs = None,
+    resume: Resume = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Search for a controller's best settings; the winner is a file for `controller: {from: …}`."""
     from dnnmso_mj.sweep.plan import parse_seeds
     from dnnmso_mj.tuning import TuneInterrupted
     from dnnmso_mj.tuning.objective import Objective
-    from dnnmso_mj.tuning.run import Request, default_storage
+    from dnnmso_mj.tuning.run import default_storage
     from dnnmso_mj.tuning.run import tune as search
+    from dnnmso_mj.tuning.search import Request
 
     request = Request(
         source=scenario,
