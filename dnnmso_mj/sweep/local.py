@@ -19,7 +19,7 @@ from multiprocessing.connection import wait
 
 from dnnmso_mj.sources import python_path
 from dnnmso_mj.sweep.plan import SweepError
-from dnnmso_mj.sweep.task import Row, Task, failed_row
+from dnnmso_mj.sweep.task import Row, Work, failed_row
 
 # The cores are shared out by the sweep; a library's own threads would only fight for them.
 ONE_THREAD = dict.fromkeys(
@@ -39,7 +39,7 @@ class LocalEngine:
     def __init__(self, jobs: int | None = None) -> None:
         self.jobs = jobs or len(os.sched_getaffinity(0))
 
-    def rows(self, tasks: Iterable[Task]) -> Generator[Row]:
+    def rows(self, tasks: Iterable[Work]) -> Generator[Row]:
         """Yield every run's row as it is finished; closing the generator ends the workers.
 
         A run whose process dies is tried once more, after all others; if that dies too, its row
@@ -58,10 +58,10 @@ class LocalEngine:
 class _Pool:
     """The workers, what each has to do, and what is to be tried again."""
 
-    def __init__(self, tasks: Iterable[Task]) -> None:
+    def __init__(self, tasks: Iterable[Work]) -> None:
         self._tasks = iter(tasks)
-        self._rest: deque[Task] = deque()  # of tasks whose process died
-        self._again: deque[Task] = deque()  # runs that were under way when it did
+        self._rest: deque[Work] = deque()  # of tasks whose process died
+        self._again: deque[Work] = deque()  # runs that were under way when it did
         self._suspects: set[tuple[int, int]] = set()
         self._workers: list[_Worker] = []
 
@@ -113,7 +113,7 @@ class _Pool:
         else:
             worker.give(task)
 
-    def _next(self) -> Task | None:
+    def _next(self) -> Work | None:
         if self._rest:
             return self._rest.popleft()
         task = next(self._tasks, None)
@@ -138,8 +138,8 @@ class _Pool:
 class _Worker:
     """One process, its task, and the seeds of it whose rows are still to come."""
 
-    def __init__(self, first: Task) -> None:
-        self.first: Task | None = first  # for when it is ready
+    def __init__(self, first: Work) -> None:
+        self.first: Work | None = first  # for when it is ready
         self.task = first
         self.seeds: deque[int] = deque()
         self.ready = False
@@ -156,7 +156,7 @@ class _Worker:
                 start_new_session=True,  # Ctrl-C is for the sweep to handle
             )
 
-    def give(self, task: Task) -> None:
+    def give(self, task: Work) -> None:
         self.task, self.seeds = task, deque(task.seeds)
         with suppress(OSError):  # it is dead, as the next message will tell
             self.pipe.send(task)
