@@ -130,9 +130,11 @@ def _print_card(name: str, lines: Sequence[Margin], rows: Mapping[str, Any]) -> 
 
     table = Table(title=f"margin card of {name}", box=None, pad_edge=False)
     table.add_column("row", no_wrap=True)
-    for column in ("median", "unit", "95 % of median", "seeds", "remarks"):
-        justify = "left" if column in {"unit", "remarks"} else "right"
-        table.add_column(column, justify=justify, no_wrap=column != "remarks")
+    table.add_column("median", justify="right", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    table.add_column("95 % of median", justify="right", no_wrap=True)
+    table.add_column("seeds", justify="right", no_wrap=True)
+    table.add_column("remarks")
     for line in lines:
         row = rows[line.row]
         if line.unused:
