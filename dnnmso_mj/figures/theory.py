@@ -26,6 +26,7 @@ from dnnmso_mj.figures.drawing import (
 )
 from dnnmso_mj.metrics import worst_error
 from dnnmso_mj.scenario import NoNetwork
+from dnnmso_mj.scenario.controller import inversion as inversion_of
 from dnnmso_mj.trace import Array, Trace
 
 Panel = Callable[[Axes, Trace], None]
@@ -167,7 +168,9 @@ def _static_bound(trace: Trace) -> float | None:
 
     It has none where K is not scalar, where B_s is general, and while the actuators saturate.
     """
-    inversion, half = trace.scenario.controller.inversion, len(trace) // 2
+    inversion, half = inversion_of(trace.scenario.controller), len(trace) // 2
+    if inversion is None:
+        return None
     K, lam = inversion.K, inversion.lam
     if inversion.slack_matrix is not None or len(set(K)) > 1 or lam == 0.0:
         return None

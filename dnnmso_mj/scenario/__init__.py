@@ -25,6 +25,7 @@ from dnnmso_mj.scenario.controller import (
     NoNetwork,
     Observer,
 )
+from dnnmso_mj.scenario.events import Event, Freeze
 from dnnmso_mj.scenario.fields import (
     FiniteEach,
     NonNegative,
@@ -45,6 +46,8 @@ __all__ = [
     "Controller",
     "DnnMso",
     "Effectiveness",
+    "Event",
+    "Freeze",
     "Imperfections",
     "Inertia",
     "Initial",
@@ -216,6 +219,8 @@ class Scenario(Strict):
     """What drives the robot."""
     imperfections: Imperfections = Imperfections()
     """Limits of the robot's parts; none unless given."""
+    events: Annotated[tuple[Event, ...], BeforeValidator(as_tuple)] = ()
+    """What happens at set times."""
     real_time: RealTime = RealTime()
     """What happens when the wall clock is not kept."""
 
