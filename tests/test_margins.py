@@ -78,12 +78,11 @@ def test_rows_are_asked_for_by_name_and_come_in_the_order_of_the_card():
         parse_rows("delay,tork")
 
 
-def test_levels_grow_with_what_is_asked_and_values_keep_their_side():
+def test_values_go_one_way_with_the_level():
     for row in ROWS.values():
         values = [row.value(level) for level in np.geomspace(row.start / 64, row.cap, 20)]
         steps = np.diff(values)
         assert (steps < 0).all() if row.smaller else (steps > 0).all()
-        assert row.worst > values[0] if row.smaller else row.worst < values[0]
 
 
 def test_the_nominal_masses_change_and_nothing_else():
@@ -222,7 +221,6 @@ def hand_made(margins: dict[str, list[float | None]], row: str = "payload"):
         "unit": spec.unit,
         "easiest": spec.value(spec.start / 2**HALVINGS),
         "cap": spec.at_cap,
-        "worst": spec.worst,
         "better": "smaller" if spec.smaller else "larger",
     }
     names = list(margins)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dnnmso_mj.cli.shared import Json, Overrides, near, print_table, working
+from dnnmso_mj.cli.shared import Json, Overrides, near, plain_spread, print_table, working
 from dnnmso_mj.cli.watching import how_to_go_on, terminated_like_ctrl_c, watching
 
 if TYPE_CHECKING:
@@ -66,11 +66,11 @@ def margins(
                 )
         except KeyboardInterrupt as stop:
             watcher.stop()
-            raise KeyboardInterrupt(how_to_go_on(watcher, plan.n_runs, out)) from stop
+            raise KeyboardInterrupt(how_to_go_on(watcher.done, plan.n_runs, out)) from stop
     lines = margins_of(result.table, result.provenance)
     ranking = rank(lines, result.provenance)
     if as_json:
-        print(json.dumps(_document(result, lines, ranking)))
+        print(json.dumps(_document(result, lines, ranking), allow_nan=False))
     else:
         _print_all(result, lines, ranking)
 
@@ -91,7 +91,7 @@ def _document(
         "controllers": provenance["controllers"],
         "model_free": provenance["model_free"],
         "definitions": provenance["rows"],
-        "margins": [vars(line) | {"spread": vars(line.spread)} for line in lines],
+        "margins": [vars(line) | {"spread": plain_spread(line.spread)} for line in lines],
         "ranking": {name: vars(found) for name, found in ranking.items()},
         "failures": _failures(result),
     }

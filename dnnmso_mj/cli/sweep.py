@@ -56,7 +56,7 @@ def sweep(
         plan = plan_sweep(scenario, parse_seeds(seeds), overrides or (), grid or ())
     out = out or default_out(plan)
     command = shlex.join(["dnnmso", *sys.argv[1:]])
-    with watching(plan.points[0].scenario.name, ("diverged", "failed")) as watcher:
+    with watching(plan.points[0].scenario.name) as watcher:
         try:
             with terminated_like_ctrl_c():
                 result = run_sweep(
@@ -64,7 +64,7 @@ def sweep(
                 )
         except KeyboardInterrupt as stop:
             watcher.stop()
-            raise KeyboardInterrupt(how_to_go_on(watcher, plan.n_runs, out)) from stop
+            raise KeyboardInterrupt(how_to_go_on(watcher.done, plan.n_runs, out)) from stop
     with working("summing up"):
         points = summarise(result.table, plan)
     if as_json:

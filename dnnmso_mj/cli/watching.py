@@ -1,4 +1,4 @@
-"""Many runs as a person sees them: how far they are, how to stop them and how to go on."""
+"""How far a long command is, and how it is stopped and gone on with."""
 
 from __future__ import annotations
 
@@ -24,12 +24,14 @@ LINE_PERIOD = 30.0  # s between lines of progress where there is no terminal
 class Watch:
     """Counts rows, and shows the count: a bar on a terminal, else a line now and then.
 
-    A row counts as bad where its status is one of `bad`.
+    Args:
+        name: of what is run.
+        bar: None without a terminal.
+        bad: statuses of rows that are counted as gone wrong.
     """
 
     def __init__(self, name: str, bar: Progress | None, bad: tuple[str, ...]) -> None:
-        self._name, self._bad = name, bad
-        self._bar = bar
+        self._name, self._bar, self._bad = name, bar, bad
         self.done, self.failures = 0, 0
         self._total, self._kept, self._ticks = 0, 0, 0
         self._started = self._said = time.monotonic()
@@ -71,8 +73,8 @@ class Watch:
 
 
 @contextmanager
-def watching(name: str, bad: tuple[str, ...]) -> Iterator[Watch]:
-    """Look on; `bad` are the statuses of rows that are counted as gone wrong."""
+def watching(name: str, bad: tuple[str, ...] = ("diverged", "failed")) -> Iterator[Watch]:
+    """A watcher of many runs, its bar taken away at the end; see `Watch`."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -99,9 +101,16 @@ def terminated_like_ctrl_c() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def how_to_go_on(watch: Watch, total: int, out: Path) -> str:
-    """What is kept of an interrupted command, and the command that goes on from it."""
+def how_to_go_on(done: int, total: int, out: Path, what: str = "rows") -> str:
+    """What an interrupted command has kept, and the command that goes on.
+
+    Args:
+        done: how much is kept.
+        total: of how much.
+        out: what it is kept beside.
+        what: it is.
+    """
     words = [word for word in sys.argv[1:] if word not in {"--force", "--resume"}]
-    where = f" beside {near(out)}" if watch.done else ""
+    where = f" beside {near(out)}" if done else ""
     command = shlex.join(["dnnmso", *words, "--resume"])
-    return f"{watch.done} of {total} rows are kept{where}; to go on:\n  {command}"
+    return f"{done} of {total} {what} are kept{where}; to go on:\n  {command}"

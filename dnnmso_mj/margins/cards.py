@@ -5,6 +5,7 @@ A table is read by its own metadata alone, so that one of another version says w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,8 +26,8 @@ class Margin:
     Args:
         controller, row: their names.
         unused: why there is none to search; "" where there is.
-        spread: over the seeds that were searched; one without a margin counts as the worst value
-            there can be. n is 0 where there was none to search.
+        spread: over the seeds that were searched; one without a margin is infinitely bad. n is 0
+            where there was none to search.
         none: seeds that fail without any of it.
         below: seeds that fail at the smallest value that is probed.
         capped: seeds that stand the largest.
@@ -130,7 +131,7 @@ def _margin(table: pa.Table, controller: str, row: str, definition: Mapping[str,
     mine = pc.and_(pc.equal(table["controller"], controller), pc.equal(table["row"], row))
     rows = table.filter(mine).to_pylist()
     searched = [line for line in rows if line["status"] not in {"unused", "failed"}]
-    worst = definition["worst"]
+    worst = -math.inf if definition["better"] == "larger" else math.inf
     values = [worst if line["margin"] is None else line["margin"] for line in searched]
     counts = {
         status: sum(line["status"] == status for line in rows)

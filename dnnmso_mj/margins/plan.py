@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.comparison.plan import controller_point
 from dnnmso_mj.margins.rows import ROWS, MarginError, is_model_free
 from dnnmso_mj.margins.search import PRECISION, Found, find_margin
 from dnnmso_mj.metrics import compute_metrics
-from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.simulate import simulate
@@ -160,25 +159,25 @@ def plan_margins(
 
     Args:
         source: a scenario file, or the name of a shipped one.
-        controllers: names, see `with_controller`.
+        controllers: each the name of a shipped tuned controller, a kind (its defaults), or a file.
         rows: keys of `ROWS`.
         seeds: of initial weights and noise; ascending.
         sets: "a.b=c", for every controller.
         limit: the largest `rmse_steady` that counts as standing (rad), the same for all.
 
     Raises:
-        ScenarioError: as `load_scenario`.
+        ScenarioError: as `load_scenario`; the place of a controller is `--controllers NAME`.
         MarginError: no controller, one twice, or a row that the scenario cannot have.
     """
     twice = [name for k, name in enumerate(controllers) if name in controllers[:k]]
     if twice or not all(controllers) or not controllers:
         wrong = f"{clean(twice[0])} is there twice" if twice else "an empty name"
         raise MarginError(f"--controllers: {wrong}; allowed: each controller once, as in a,b,c")
-    points = []
+    points: list[Cell] = []
+    models: dict[str, Mjcf] = {}
     for name in controllers:
-        scenario = with_controller(source, name, sets)
-        mjcf = Mjcf.read(find_model(scenario.plant.model))
-        _first_tick(scenario, mjcf)  # also compiles what every worker then loads
+        point = controller_point(source, name, sets, models)
+        scenario, mjcf = point.scenario, point.mjcf
         for row in rows:
             spec = ROWS[row]
             if not spec.unused(scenario):
@@ -186,17 +185,6 @@ def plan_margins(
                 _first_tick(spec.changed(scenario, spec.start), mjcf)
             points.append(Cell(name, row, scenario, mjcf))
     return MarginPlan(str(source), tuple(seeds), tuple(points), limit)
-
-
-def with_controller(source: str | Path, name: str, sets: Sequence[str] = ()) -> Scenario:
-    """The scenario with the controller of that kind, its settings the kind's defaults.
-
-    Args:
-        source: a scenario file, or the name of a shipped one.
-        name: a kind of controller.
-        sets: "a.b=c", put in afterwards.
-    """
-    return load_scenario(source, [f"controller={{kind: {name}}}", *sets])
 
 
 def model_free(plan: MarginPlan) -> tuple[str, ...]:

@@ -42,7 +42,6 @@ class MarginRow:
         start: the first level that is probed.
         cap: the largest one.
         value: level -> the imperfection in its unit.
-        worst: the value of a controller that stands nothing of it.
         change: puts a value into a scenario's document.
         smaller: whether the smaller value is the better one.
         unused: why the row would change nothing for a scenario's controller; "" where it would.
@@ -53,7 +52,6 @@ class MarginRow:
     start: float
     cap: float
     value: Callable[[float], float]
-    worst: float
     change: Callable[[Document, Scenario, float], None]
     smaller: bool = False
     unused: Callable[[Scenario], str] = _always_used
@@ -149,7 +147,6 @@ ROWS: Mapping[str, MarginRow] = {
         start=5e-4,
         cap=0.512,
         value=_same,
-        worst=0.0,
         change=_actuator_delay,
     ),
     "payload": MarginRow(
@@ -158,7 +155,6 @@ ROWS: Mapping[str, MarginRow] = {
         start=0.1,
         cap=51.2,
         value=_same,
-        worst=0.0,
         change=_payload,
     ),
     "friction": MarginRow(
@@ -167,7 +163,6 @@ ROWS: Mapping[str, MarginRow] = {
         start=0.1,
         cap=102.4,
         value=_same,
-        worst=0.0,
         change=_friction,
     ),
     "noise": MarginRow(
@@ -176,7 +171,6 @@ ROWS: Mapping[str, MarginRow] = {
         start=0.125,
         cap=1024.0,
         value=_same,
-        worst=0.0,
         change=_noise,
     ),
     "model_above": MarginRow(
@@ -185,7 +179,6 @@ ROWS: Mapping[str, MarginRow] = {
         start=0.05,
         cap=12.8,
         value=_above,
-        worst=1.0,
         change=_nominal_masses,
         unused=_no_masses,
     ),
@@ -195,7 +188,6 @@ ROWS: Mapping[str, MarginRow] = {
         start=0.05,
         cap=12.8,
         value=_below,
-        worst=1.0,
         change=_nominal_masses,
         smaller=True,
         unused=_no_masses,
@@ -206,7 +198,6 @@ ROWS: Mapping[str, MarginRow] = {
         start=1 / 400.0,
         cap=1.0,
         value=_inverse,
-        worst=1e9,  # more than any that is probed
         change=_torque_limit,
         smaller=True,
     ),

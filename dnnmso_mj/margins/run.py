@@ -160,6 +160,5 @@ def _row_document(name: str) -> dict[str, Any]:
         "first": row.value(row.start),
         "easiest": row.value(row.start / 2**HALVINGS),
         "cap": row.at_cap,
-        "worst": row.worst,
         "better": "smaller" if row.smaller else "larger",
     }

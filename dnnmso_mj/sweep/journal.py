@@ -199,7 +199,7 @@ class Journal:
 
     def _check_same(self, before: Any) -> None:
         now = json.loads(json.dumps(self._plan.definition()))
-        found = list(_differences(before, now, ""))
+        found = list(differences(before, now, ""))
         if found:
             more = [f"… and {len(found) - LISTED} more"] if len(found) > LISTED else []
             listed = "\n  ".join(found[:LISTED] + more)
@@ -280,15 +280,15 @@ def _writing(path: Path) -> Iterator[None]:
         raise SweepError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def _differences(before: Any, now: Any, path: str) -> Iterator[str]:
+def differences(before: Any, now: Any, path: str) -> Iterator[str]:
     """Where two values of JSON differ, as `key.path: before; now: after`."""
     if isinstance(before, dict) and isinstance(now, dict):
         for key in before | now:
             below = f"{path}.{key}" if path else key
-            yield from _differences(before.get(key), now.get(key), below)
+            yield from differences(before.get(key), now.get(key), below)
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
         for k, (one, other) in enumerate(zip(before, now, strict=True)):
-            yield from _differences(one, other, f"{path}.{k}")
+            yield from differences(one, other, f"{path}.{k}")
     elif isinstance(before, list) and isinstance(now, list):
         yield f"{path}: {len(before)} entries; now: {len(now)}"
     elif before != now:

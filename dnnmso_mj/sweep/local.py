@@ -16,6 +16,7 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import wait
+from typing import Self
 
 from dnnmso_mj.sources import python_path
 from dnnmso_mj.sweep.plan import SweepError
@@ -48,35 +49,60 @@ class LocalEngine:
         Raises:
             SweepError: workers cannot be started.
         """
-        pool = _Pool(tasks)
+        with WorkerPool(self.jobs) as pool:
+            yield from pool.rows(tasks)
+
+
+class WorkerPool:
+    """Worker processes that stay for more tasks; a context manager that ends them.
+
+    Args:
+        jobs: how many at most; they are started when there is something to do.
+    """
+
+    def __init__(self, jobs: int) -> None:
+        self.jobs = jobs
+        self._workers: list[_Worker] = []
+        self._begin(())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.kill()
+
+    def rows(self, tasks: Iterable[Work]) -> Generator[Row]:
+        """Yield every run's row as it is finished; see `LocalEngine.rows`.
+
+        Closing the generator before its end ends the workers; the next call starts others.
+        """
+        self._begin(tasks)
+        finished = False
         try:
-            yield from pool.rows(self.jobs)
+            for worker in self._workers:
+                self._feed(worker)
+            while len(self._workers) < self.jobs and self._start():
+                pass
+            while busy := [worker.pipe for worker in self._workers if worker.busy]:
+                speaking = wait(busy)
+                for worker in [worker for worker in self._workers if worker.pipe in speaking]:
+                    yield from self._listen(worker)
+            finished = True
         finally:
-            pool.kill()
+            if not finished:
+                self.kill()
 
+    def kill(self) -> None:
+        """End the workers, whatever they do."""
+        for worker in self._workers:
+            worker.kill()
+        self._workers.clear()
 
-class _Pool:
-    """The workers, what each has to do, and what is to be tried again."""
-
-    def __init__(self, tasks: Iterable[Work]) -> None:
+    def _begin(self, tasks: Iterable[Work]) -> None:
         self._tasks = iter(tasks)
         self._rest: deque[Work] = deque()  # of tasks whose process died
         self._again: deque[Work] = deque()  # runs that were under way when it did
         self._suspects: set[tuple[int, int]] = set()
-        self._workers: list[_Worker] = []
-
-    def rows(self, jobs: int) -> Iterator[Row]:
-        for _ in range(jobs):
-            self._start()
-        while self._workers:
-            speaking = wait([worker.pipe for worker in self._workers])
-            for worker in [worker for worker in self._workers if worker.pipe in speaking]:
-                yield from self._listen(worker)
-
-    def kill(self) -> None:
-        for worker in self._workers:
-            worker.kill()
-        self._workers.clear()
 
     def _listen(self, worker: _Worker) -> Iterator[Row]:
         """Take one message, or the end, of a worker; give it more to do when it is done."""
@@ -94,23 +120,23 @@ class _Pool:
         if not worker.seeds:
             self._feed(worker)
 
-    def _start(self) -> None:
+    def _start(self) -> bool:
+        """One more worker, if there is a task for it."""
         task = self._next()
-        if task is not None:
-            try:
-                self._workers.append(_Worker(task))
-            except OSError as error:
-                raise SweepError(
-                    f"--jobs: worker process {len(self._workers) + 1} cannot be started: "
-                    f"{error.strerror or error}; allowed: fewer --jobs"
-                ) from error
+        if task is None:
+            return False
+        try:
+            self._workers.append(_Worker(task))
+        except OSError as error:
+            raise SweepError(
+                f"--jobs: worker process {len(self._workers) + 1} cannot be started: "
+                f"{error.strerror or error}; allowed: fewer --jobs"
+            ) from error
+        return True
 
     def _feed(self, worker: _Worker) -> None:
         task, worker.first = worker.first or self._next(), None
-        if task is None:
-            self._workers.remove(worker)
-            worker.kill()
-        else:
+        if task is not None:
             worker.give(task)
 
     def _next(self) -> Work | None:
@@ -155,6 +181,11 @@ class _Worker:
                 env=os.environ | ONE_THREAD | {"PYTHONPATH": python_path()},
                 start_new_session=True,  # Ctrl-C is for the sweep to handle
             )
+
+    @property
+    def busy(self) -> bool:
+        """Whether it has something to say before it is given more to do."""
+        return bool(self.seeds) or not self.ready
 
     def give(self, task: Work) -> None:
         self.task, self.seeds = task, deque(task.seeds)
