@@ -28,7 +28,7 @@ STRIP = 0.26  # half height of a strip of points, of the distance between two gr
 
 
 def spread_figure(
-    groups: Mapping[str, Array], x: str, *, title: str = "", zero: bool = False
+    groups: Mapping[str, Array], x: str, *, title: str = "", mark: float | None = None
 ) -> Figure:
     """Every value as a point, a box from quartile to quartile, and the median, a row a group.
 
@@ -36,7 +36,7 @@ def spread_figure(
         groups: label -> finite values (k,).
         x: the axis' label, with its unit.
         title: of the panel.
-        zero: whether the axis is linear, with a line at zero.
+        mark: where a dashed line stands.
     """
     figure, axes = _rows(list(groups), title)
     rng = np.random.default_rng(0)  # of the points' heights alone
@@ -56,9 +56,9 @@ def spread_figure(
         low, middle, high = np.percentile(values, [25.0, 50.0, 75.0])
         axes.barh(k, high - low, 2 * STRIP, left=low, fill=False, edgecolor=INK, linewidth=0.9)
         axes.plot([middle, middle], [k - STRIP, k + STRIP], color=COLOURS[1], linewidth=2.0)
-    if zero:
-        axes.axvline(0.0, color=INK, **DASHED)
-    elif _spans_decades(np.concatenate(list(groups.values()))):
+    if mark is not None:
+        axes.axvline(mark, color=INK, **DASHED)
+    if _spans_decades(np.concatenate(list(groups.values()))):
         values = np.concatenate(list(groups.values()))
         _logarithmic(axes, values.max() / values.min())
     axes.set_xlabel(x)

@@ -97,11 +97,18 @@ def _table_section(file: Path, name: str) -> Section:
 
 def _makers() -> Mapping[bytes, Callable[[Any, Mapping[str, Any]], Section]]:
     """Key of a table's metadata -> what makes a section of it."""
+    from dnnmso_mj.margins.run import MARGINS
     from dnnmso_mj.report.margins import margins_section
-    from dnnmso_mj.report.runs import comparison_section, sweep_section
+    from dnnmso_mj.sweep.table import SWEEP
 
-    return {
-        b"dnnmso_sweep": sweep_section,
-        b"dnnmso_compare": comparison_section,
-        b"dnnmso_margins": margins_section,
-    }
+    return {SWEEP.key: _runs_section, MARGINS.key: margins_section}
+
+
+def _runs_section(table: Any, provenance: Mapping[str, Any]) -> Section:
+    """A comparison is a sweep of controllers."""
+    from dnnmso_mj.comparison.plan import COLUMN
+    from dnnmso_mj.report.comparison import comparison_section
+    from dnnmso_mj.report.runs import sweep_section
+
+    compared = COLUMN in provenance["definition"]["points"][0]["parameters"]
+    return (comparison_section if compared else sweep_section)(table, provenance)

@@ -30,13 +30,16 @@ METRICS: Mapping[str, tuple[str, str]] = {
 }
 
 INTERVAL = (
-    "Intervals are 95 % intervals of the median over seeds (percentile bootstrap; of very many "
-    "values, exact from order statistics). With fewer than six values there is none. Runs that "
-    "diverged or failed are listed and never averaged in."
+    "Intervals are 95 % intervals of the median over seeds: by percentile bootstrap, or exact from "
+    "order statistics where values are very many or some are infinite. With fewer than six values "
+    "there is none."
 )
-PAIRED = (
-    "Differences are taken seed by seed between runs with the same seed, and so the same noise; "
-    "seeds at which either run did not end well have none."
+SWEPT = "In a sweep, runs that diverged or failed are listed, and have no part in the statistics."
+COMPARED = (
+    "In a comparison, a run that diverged or failed counts as infinitely bad (∞) in the ranking "
+    "and the pairs. Ratios are taken seed by seed between runs with the same seed, and so the same "
+    "noise; under 1 the controller is better. p is of Wilcoxon's signed-rank test, two-sided, on "
+    "their logarithms, and p (Holm) is corrected for all pairs of the table."
 )
 MARGINS = (
     "A margin is the largest value (of the torque limit and of factors below 1: the smallest) that "

@@ -5,17 +5,28 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from dnnmso_mj.sweep.statistics import Spread
+
 
 def value(number: Any) -> str:
     """A number in four digits; a dash for none."""
     if number is None:
         return "–"
-    return f"{number:.4g}" if isinstance(number, float) else str(number)
+    if not isinstance(number, float):
+        return str(number)
+    return f"{number:.4g}".replace("inf", "∞")
 
 
 def interval(low: float | None, high: float | None) -> str:
     """Two ends; a dash for none."""
     return "–" if low is None or high is None else f"{value(low)} … {value(high)}"
+
+
+def with_interval(found: Spread) -> str:
+    """A median with its 95 % interval, if there is one."""
+    if found.ci_low is None:
+        return value(found.median)
+    return f"{value(found.median)} [{interval(found.ci_low, found.ci_high)}]"
 
 
 def listing(items: Mapping[str, object]) -> str:
