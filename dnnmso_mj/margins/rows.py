@@ -90,13 +90,16 @@ def _payload(document: Document, _scenario: Scenario, value: float) -> None:
 
 def _friction(document: Document, _scenario: Scenario, value: float) -> None:
     before = document["imperfections"].get("friction", {})
-    friction = before | {"coulomb": (value,), "viscous": (VISCOUS_RATIO * value,)}
-    document["imperfections"]["friction"] = friction
+    dry = {"coulomb": (value,), "breakaway": None}  # at rest as much as in motion
+    viscous = {"viscous": (VISCOUS_RATIO * value,)}
+    document["imperfections"]["friction"] = before | dry | viscous
 
 
 def _noise(document: Document, _scenario: Scenario, value: float) -> None:
-    document["imperfections"]["position_noise"] = (POSITION_NOISE * value,)
-    document["imperfections"]["velocity_noise"] = (VELOCITY_NOISE * value,)
+    imperfections = document["imperfections"]
+    imperfections["position_noise"] = (POSITION_NOISE * value,)
+    if imperfections.get("velocity_from") != "difference":  # of angles, whose noise it has then
+        imperfections["velocity_noise"] = (VELOCITY_NOISE * value,)
 
 
 def _torque_limit(document: Document, _scenario: Scenario, value: float) -> None:
