@@ -56,11 +56,11 @@ def spread_figure(
         low, middle, high = np.percentile(values, [25.0, 50.0, 75.0])
         axes.barh(k, high - low, 2 * STRIP, left=low, fill=False, edgecolor=INK, linewidth=0.9)
         axes.plot([middle, middle], [k - STRIP, k + STRIP], color=COLOURS[1], linewidth=2.0)
+    shown = np.concatenate([*groups.values(), [] if mark is None else [mark]])
     if mark is not None:
         axes.axvline(mark, color=INK, **DASHED)
-    if _spans_decades(np.concatenate(list(groups.values()))):
-        values = np.concatenate(list(groups.values()))
-        _logarithmic(axes, values.max() / values.min())
+    if shown.size and shown.min() > 0.0 and shown.max() > LOG_FROM * shown.min():
+        _logarithmic(axes, shown.max() / shown.min())
     axes.set_xlabel(x)
     return figure
 
@@ -126,6 +126,7 @@ def _rows(labels: Sequence[str], title: str) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     axes = figure.add_subplot()
     axes.set_yticks(range(len(labels)), [_label(text) for text in labels])
+    axes.use_sticky_edges = False  # room beside the outermost bar
     axes.set_ylim(len(labels) - 0.5, -0.5)
     axes.grid(visible=False, axis="y")
     axes.tick_params(axis="y", length=0)
@@ -161,7 +162,3 @@ def _label(text: str) -> str:
 def _plain(text: str) -> str:
     """Not as a formula."""
     return text.replace("$", r"\$")
-
-
-def _spans_decades(values: Array) -> bool:
-    return bool(values.size) and values.min() > 0.0 and values.max() > LOG_FROM * values.min()

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 # name -> unit, meaning; the names are `compute_metrics`' own.
 METRICS: Mapping[str, tuple[str, str]] = {
     "rmse": ("rad", "Root of the mean square of q − q_ref over all ticks and joints."),
-    "rmse_steady": ("rad", "The same over the last half of the run."),
+    "rmse_steady": ("rad", "Root of the mean square of q − q_ref over joints and the last half."),
     "max_abs_error_steady": ("rad", "Largest |q − q_ref| of any joint in the last half."),
     "tau_peak": ("N·m", "Largest torque that was applied to any joint."),
     "tau_chatter": (
