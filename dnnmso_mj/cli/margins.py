@@ -158,13 +158,14 @@ def _print_matrix(
 
     rows = provenance["rows"]
     table = Table(title="medians", box=None, pad_edge=False)
-    table.add_column("controller", no_wrap=True)
+    table.add_column("controller")
     for name, row in rows.items():
-        table.add_column(f"{name} ({row['unit']})" if row["unit"] else name, justify="right")
+        unit = f"\n({row['unit']})" if row["unit"] else ""
+        table.add_column(f"{name}{unit}".replace("_", "\n", 1), justify="right", no_wrap=True)
     for name in provenance["controllers"]:
         mine = [line for line in lines if line.controller == name]
-        title = name if name in provenance["model_free"] else f"{name} (has a model)"
+        title = name if name in provenance["model_free"] else f"{name} †"
         table.add_row(title, *(cell_text(line, rows[line.row], ranking) for line in mine))
     print_table(table)
-    print("** the best median of those without a model; * its interval meets the best's")
+    print("† has a model; of the others: ** the best median, * its interval meets the best's")
     print()

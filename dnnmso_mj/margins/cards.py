@@ -101,8 +101,13 @@ def value_text(value: float | None, row: Mapping[str, Any]) -> str:
     if is_none(value, row):
         return "none"
     if is_capped(value, row):
-        return f"{'>' if row['better'] == 'larger' else '<'} {row['cap']:.3g}"
-    return f"{value:.3g}"
+        return f"{'>' if row['better'] == 'larger' else '<'} {_digits(row['cap'])}"
+    return _digits(value)
+
+
+def _digits(value: float) -> str:
+    """Three digits: the search is no finer."""
+    return f"{value:.0f}" if 100.0 <= value < 1e5 else f"{value:.3g}"
 
 
 def interval_text(margin: Margin, row: Mapping[str, Any]) -> str:

@@ -172,7 +172,7 @@ ROWS: Mapping[str, MarginRow] = {
         what=f"factor of a noise of {POSITION_NOISE:g} rad and {VELOCITY_NOISE:g} rad/s",
         unit="",
         start=0.125,
-        cap=1024.0,
+        cap=1000.0,
         value=_same,
         change=_noise,
     ),
