@@ -14,7 +14,7 @@ import pytest
 from sweep_samples import dnnmso, rows_in
 
 from dnnmso_mj.loading import load_scenario
-from dnnmso_mj.margins.cards import cell_text, interval_text, margins_of, rank, value_text
+from dnnmso_mj.margins.cards import cell_text, interval_text, margins_of, rank, unfound, value_text
 from dnnmso_mj.margins.plan import MarginPlan, MarginTask, model_free, plan_margins
 from dnnmso_mj.margins.rows import ROWS, MarginError, is_model_free, nominal_model, parse_rows
 from dnnmso_mj.margins.run import run_margins
@@ -269,6 +269,13 @@ def test_a_seed_without_a_margin_pulls_the_interval_down_to_none():
     table, provenance = hand_made({"a": [51.2] * 7})
     (line,) = margins_of(table, provenance)
     assert interval_text(line, provenance["rows"]["payload"]) == "> 51.2"
+
+
+def test_a_seed_that_fails_at_once_is_told_once_for_all_its_rows():
+    one, _ = hand_made({"a": [2.0, None]}, "payload")
+    other, _ = hand_made({"a": [2.0, None]}, "noise")
+    (found,) = unfound(pa.concat_tables([one, other]))
+    assert (found.controller, found.seed, found.rows) == ("a", 1, ("payload", "noise"))
 
 
 def test_controllers_are_told_apart_by_what_they_know():

@@ -78,6 +78,8 @@ def margins(
 def _document(
     result: MarginResult, lines: Sequence[Margin], ranking: Mapping[str, Ranking]
 ) -> dict[str, Any]:
+    from dnnmso_mj.margins.cards import unfound
+
     provenance = result.provenance
     return {
         "status": "completed",
@@ -93,27 +95,23 @@ def _document(
         "definitions": provenance["rows"],
         "margins": [vars(line) | {"spread": plain_spread(line.spread)} for line in lines],
         "ranking": {name: vars(found) for name, found in ranking.items()},
-        "failures": _failures(result),
+        "failures": [vars(found) for found in unfound(result.table)],
     }
-
-
-def _failures(result: MarginResult) -> list[dict[str, Any]]:
-    """Searches that found no margin, with seed and reason."""
-    names = ["controller", "row", "seed", "status", "reason"]
-    rows: list[dict[str, Any]] = result.table.select(names).to_pylist()
-    return [row for row in rows if row["status"] in {"none", "failed"}]
 
 
 def _print_all(
     result: MarginResult, lines: Sequence[Margin], ranking: Mapping[str, Ranking]
 ) -> None:
+    from dnnmso_mj.margins.cards import unfound
+
     rows = result.provenance["rows"]
     for name in result.provenance["controllers"]:
         _print_card(name, [line for line in lines if line.controller == name], rows)
     _print_matrix(result.provenance, lines, ranking)
-    failures = _failures(result)
-    for failure in failures[:FAILURES_SHOWN]:
-        print("{controller}, {row}, seed {seed}: {status}: {reason}".format(**failure))
+    failures = unfound(result.table)
+    for found in failures[:FAILURES_SHOWN]:
+        where = f"{found.controller}, seed {found.seed}, {', '.join(found.rows)}"
+        print(f"{where}: {found.status}: {found.reason}")
     if len(failures) > FAILURES_SHOWN:
         print(f"… and {len(failures) - FAILURES_SHOWN} more; --json has them all")
     print(f"stands: not diverged, and rmse_steady <= {result.provenance['limit']:g} rad")

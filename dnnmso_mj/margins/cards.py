@@ -54,6 +54,32 @@ class Ranking:
     within: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class Unfound:
+    """A seed without a margin in some rows, all for the same reason.
+
+    Args:
+        controller, seed, status, reason: as in the table; the status is none or failed.
+        rows: names.
+    """
+
+    controller: str
+    rows: tuple[str, ...]
+    seed: int
+    status: str
+    reason: str
+
+
+def unfound(table: pa.Table) -> list[Unfound]:
+    """Searches that failed, or whose controller fails without any imperfection."""
+    groups: dict[tuple[str, int, str, str], list[str]] = {}
+    for line in table.select(["controller", "seed", "status", "reason", "row"]).to_pylist():
+        *key, row = line.values()
+        if line["status"] in {"none", "failed"}:
+            groups.setdefault(tuple(key), []).append(row)
+    return [Unfound(name, tuple(rows), *others) for (name, *others), rows in groups.items()]
+
+
 def margins_of(table: pa.Table, provenance: Mapping[str, Any]) -> list[Margin]:
     """Every line of every card, by controller, then row."""
     return [

@@ -18,6 +18,7 @@ from dnnmso_mj.margins.cards import (
     margins_of,
     mark,
     rank,
+    unfound,
     value_text,
 )
 from dnnmso_mj.report.definitions import INTERVAL, MARGINS
@@ -27,7 +28,6 @@ from dnnmso_mj.report.words import facts_of, interval
 
 COUNTS = ("none", "below", "capped", "failed", "non_monotone")
 FAILURES_LISTED = 500
-UNFOUND = {"none", "failed"}
 
 
 def margins_section(table: pa.Table, provenance: Mapping[str, Any]) -> Section:
@@ -120,11 +120,14 @@ def _definitions(provenance: Mapping[str, Any]) -> TableBlock:
 
 
 def _failures(table: pa.Table) -> TableBlock:
-    names = ["controller", "row", "seed", "status", "reason"]
-    found = [row for row in table.select(names).to_pylist() if row["status"] in UNFOUND]
-    body = [[str(row[name]) for name in names] for row in found[:FAILURES_LISTED]]
+    found = unfound(table)
+    header = ["controller", "seed", "rows", "status", "reason"]
+    body = [
+        [line.controller, str(line.seed), ", ".join(line.rows), line.status, line.reason]
+        for line in found[:FAILURES_LISTED]
+    ]
     more = f"The first {FAILURES_LISTED} of {len(found)}." if len(found) > FAILURES_LISTED else ""
-    return TableBlock("Searches without a margin", names if body else ["none"], body, more)
+    return TableBlock("Searches without a margin", header if body else ["none"], body, more)
 
 
 def _named(name: str, row: Mapping[str, Any]) -> str:
