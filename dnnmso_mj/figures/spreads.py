@@ -92,8 +92,8 @@ def interval_figure(
     Args:
         bars: from top to bottom.
         x: the axis' label, with its unit.
-        ends: left and right, beyond which nothing is drawn: what lies outside is put at the end,
-            where its text says so. The axis is no longer than the bars need.
+        ends: left and right, beyond which nothing is drawn: a cross at the end stands for what
+            lies outside. The axis is no longer than the bars need.
         title: of the panel.
     """
     figure, axes = _rows([bar.label for bar in bars], title)
@@ -108,7 +108,8 @@ def interval_figure(
             if bar.low is not None and bar.high is not None:
                 low, high = np.clip([bar.low, bar.high], low_end, high_end)
                 axes.barh(k, high - low, 0.34, left=low, color=colour, alpha=0.35)
-            axes.plot([middle], [k], marker="o", markersize=5.0, color=colour, clip_on=False)
+            marker = "o" if middle == bar.middle else "x"
+            axes.plot([middle], [k], marker=marker, markersize=5.0, color=colour, clip_on=False)
         axes.annotate(
             bar.text,
             (1.01, k),

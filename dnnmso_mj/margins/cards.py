@@ -72,12 +72,15 @@ class Unfound:
 
 def unfound(table: pa.Table) -> list[Unfound]:
     """Searches that failed, or whose controller fails without any imperfection."""
-    groups: dict[tuple[str, int, str, str], list[str]] = {}
-    for line in table.select(["controller", "seed", "status", "reason", "row"]).to_pylist():
-        *key, row = line.values()
+    rows: dict[tuple[str, int, str, str], list[str]] = {}
+    for line in table.to_pylist():
         if line["status"] in {"none", "failed"}:
-            groups.setdefault(tuple(key), []).append(row)
-    return [Unfound(name, tuple(rows), *others) for (name, *others), rows in groups.items()]
+            key = (line["controller"], line["seed"], line["status"], line["reason"])
+            rows.setdefault(key, []).append(line["row"])
+    return [
+        Unfound(controller, tuple(names), seed, status, reason)
+        for (controller, seed, status, reason), names in rows.items()
+    ]
 
 
 def margins_of(table: pa.Table, provenance: Mapping[str, Any]) -> list[Margin]:
