@@ -102,6 +102,25 @@ def test_the_torque_limit_shrinks_with_the_level():
     assert ROWS["torque_limit"].changed(scenario, 1 / 80).imperfections.torque_limit == (80.0,)
 
 
+def test_rows_put_their_value_where_a_scenario_has_it():
+    scenario = load_scenario("paper")
+    document = scenario.model_dump()
+    for name, value in {"delay": 0.0125, "noise": 3.0, "friction": 2.0, "payload": 1.2}.items():
+        ROWS[name].change(document, scenario, value)
+    imperfections = document["imperfections"]
+    assert imperfections["actuator_delay"] == 0.0125  # s
+    assert imperfections["position_noise"] == pytest.approx((3e-4,))  # rad
+    assert imperfections["velocity_noise"] == pytest.approx((3e-3,))  # rad/s
+    friction = imperfections["friction"]
+    assert (friction["coulomb"], friction["viscous"]) == ((2.0,), (1.0,))
+    assert document["events"] == ({"kind": "payload", "at": 0.0, "mass": 1.2},)
+
+
+def test_what_no_scenario_can_have_is_refused_with_the_key():
+    with pytest.raises(MarginError, match=r"torque_limit.*allowed"):
+        ROWS["torque_limit"].changed(load_scenario("paper"), -1.0)
+
+
 def test_no_masses_and_no_regressor_is_free_of_a_model():
     assert not is_model_free(load_scenario("paper").controller)
     assert is_model_free(load_scenario("paper", [CONSTANT]).controller)

@@ -13,6 +13,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from dnnmso_mj.errors import DnnmsoError
+from dnnmso_mj.loading.complaints import explain
 from dnnmso_mj.scenario import Inertia, Scenario
 from dnnmso_mj.wording import clean, did_you_mean
 
@@ -74,9 +75,8 @@ class MarginRow:
         try:
             return Scenario.model_validate(document)
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise MarginError(f"{self.what}: {where}: {first['msg']}") from error
+            problems = "; ".join(complaint.text for complaint in explain(error, document))
+            raise MarginError(f"{self.what}: {problems}") from error
 
 
 def _actuator_delay(document: Document, _scenario: Scenario, value: float) -> None:

@@ -87,9 +87,8 @@ def _figure(
                 )
             )
     ends = (row["easiest"], row["cap"])
-    caption = (
-        f"{name}: {row['what']}. Further right is better. Dot: median; bar: its 95 % interval."
-    )
+    reading = "Further right is better. Dot: median; bar: its 95 % interval; cross: none."
+    caption = f"{name}: {row['what']}. {reading}"
     return picture(caption, partial(interval_figure, bars, _named(name, row), ends, title=name))
 
 
