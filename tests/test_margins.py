@@ -326,10 +326,11 @@ def test_bad_input_is_one_message_and_status_2(tmp_path: Path):
         (*common, "nobody"),
         (*common, "no_network", "--rows", "wind"),
         (*common, "no_network,"),
+        (*common, "no_network", "--limit", "nan"),
     ):
         done = dnnmso(*words, cwd=tmp_path)
         assert done.returncode == 2
-        assert done.stderr.startswith("error: ")
+        assert done.stderr.startswith("error: --")
         assert "allowed" in done.stderr
         assert "Traceback" not in done.stderr
     assert not list(tmp_path.rglob("*.parquet*"))

@@ -12,7 +12,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dnnmso_mj.cli.shared import Json, Overrides, near, number, plain_spread, print_table, working
+from dnnmso_mj.cli.shared import (
+    Force,
+    Jobs,
+    Json,
+    Overrides,
+    Resume,
+    ScenarioName,
+    near,
+    number,
+    plain_spread,
+    print_table,
+    working,
+)
 from dnnmso_mj.cli.watching import how_to_go_on, terminated_like_ctrl_c, watching
 
 if TYPE_CHECKING:
@@ -31,7 +43,7 @@ UNITS = {
 
 
 def compare(
-    scenario: Annotated[str, typer.Argument(help="A scenario file, or the name of a shipped one.")],
+    scenario: ScenarioName,
     controllers: Annotated[
         str,
         typer.Option(
@@ -41,12 +53,10 @@ def compare(
     ],
     seeds: Annotated[str, typer.Option(metavar="START:STOP", help="The same for each.")],
     overrides: Overrides = None,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Runs at once; default all cores.")
-    ] = None,
+    jobs: Jobs = None,
     out: Annotated[Path | None, typer.Option(help="Default logs/NAME.compare.parquet.")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on from what is there.")] = False,
-    force: Annotated[bool, typer.Option(help="Start anew whatever is there.")] = False,
+    resume: Resume = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Hold controllers against one another, seed by seed; one row a run to Parquet."""
@@ -60,18 +70,12 @@ def compare(
     with working("checking every controller"):
         plan = plan_comparison(scenario, names, numbers, overrides or ())
     out = out or default_out(plan)
-    command = shlex.join(["dnnmso", *sys.argv[1:]])
+    engine, command = LocalEngine(jobs), shlex.join(["dnnmso", *sys.argv[1:]])
     with watching(plan.points[0].scenario.name) as watcher:
         try:
             with terminated_like_ctrl_c():
                 result = run_sweep(
-                    plan,
-                    out,
-                    LocalEngine(jobs),
-                    resume=resume,
-                    force=force,
-                    watcher=watcher,
-                    command=command,
+                    plan, out, engine, resume=resume, force=force, watcher=watcher, command=command
                 )
         except KeyboardInterrupt as stop:
             watcher.stop()

@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dnnmso_mj.cli.shared import Json, Overrides, near, plain_spread, print_table, working
+from dnnmso_mj.cli.shared import (
+    Force,
+    Jobs,
+    Json,
+    Overrides,
+    Resume,
+    ScenarioName,
+    near,
+    plain_spread,
+    print_table,
+    working,
+)
 from dnnmso_mj.cli.watching import how_to_go_on, terminated_like_ctrl_c, watching
 
 if TYPE_CHECKING:
@@ -23,8 +34,13 @@ COUNTS = ("none", "below", "capped", "failed", "non_monotone")
 
 
 def margins(
-    scenario: Annotated[str, typer.Argument(help="A scenario file, or the name of a shipped one.")],
-    controllers: Annotated[str, typer.Option(metavar="A,B,C", help="Which to search.")],
+    scenario: ScenarioName,
+    controllers: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B,C", help="Shipped tuned controllers, kinds (their defaults), files."
+        ),
+    ],
     seeds: Annotated[str, typer.Option(metavar="START:STOP", help="Or a number, or a list.")],
     rows: Annotated[
         str | None,
@@ -34,15 +50,13 @@ def margins(
         ),
     ] = None,
     limit: Annotated[
-        float, typer.Option(min=1e-9, help="Largest rmse_steady that counts as standing (rad).")
+        float, typer.Option(help="Largest rmse_steady that counts as standing (rad).")
     ] = 0.02,
     overrides: Overrides = None,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Searches at once; default all cores.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="Default logs/NAME-margins.parquet.")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on from what is there.")] = False,
-    force: Annotated[bool, typer.Option(help="Start anew whatever is there.")] = False,
+    jobs: Jobs = None,
+    out: Annotated[Path | None, typer.Option(help="Default logs/NAME.margins.parquet.")] = None,
+    resume: Resume = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Search how much of each imperfection controllers stand."""

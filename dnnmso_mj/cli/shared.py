@@ -21,6 +21,10 @@ BAD_INPUT = 2
 INTERRUPTED = 130
 
 Log = Annotated[Path, typer.Argument(help="A log that `dnnmso run` wrote (.mcap).")]
+ScenarioName = Annotated[str, typer.Argument(help="A scenario file, or the name of a shipped one.")]
+Jobs = Annotated[int | None, typer.Option(min=1, help="Runs at once; default all cores.")]
+Resume = Annotated[bool, typer.Option(help="Go on from what is there.")]
+Force = Annotated[bool, typer.Option(help="Start anew whatever is there.")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change a key, e.g. plant.gravity=1.62."),

@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dnnmso_mj.cli.shared import Json, Overrides, near, number, print_table, working
+from dnnmso_mj.cli.shared import (
+    Force,
+    Jobs,
+    Json,
+    Overrides,
+    Resume,
+    ScenarioName,
+    near,
+    number,
+    print_table,
+    working,
+)
 from dnnmso_mj.cli.watching import how_to_go_on, terminated_like_ctrl_c, watching
 
 if TYPE_CHECKING:
@@ -26,24 +37,22 @@ FAILURES_IN_JSON = 100
 
 
 def sweep(
-    scenario: Annotated[str, typer.Argument(help="A scenario file, or the name of a shipped one.")],
+    scenario: ScenarioName,
     seeds: Annotated[str, typer.Option(metavar="START:STOP", help="Or a number, or a list.")],
     overrides: Overrides = None,
     grid: Annotated[
         list[str] | None,
         typer.Option(metavar="KEY=VALUE,VALUE", help="Several: every combination of them."),
     ] = None,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Runs at once; default all cores.")
-    ] = None,
+    jobs: Jobs = None,
     engine: Annotated[str, typer.Option(help="local, or ray for many machines.")] = "local",
     address: Annotated[
         str | None,
         typer.Option(help="Of a Ray cluster: auto or HOST:PORT; default: start one here."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Default logs/NAME.parquet.")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on from what is there.")] = False,
-    force: Annotated[bool, typer.Option(help="Start anew whatever is there.")] = False,
+    resume: Resume = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Run many seeds and parameters; one row a run to Parquet."""

@@ -14,17 +14,28 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dnnmso_mj.cli.shared import Json, Overrides, near, number, print_table
+from dnnmso_mj.cli.shared import (
+    Force,
+    Jobs,
+    Json,
+    Overrides,
+    Resume,
+    ScenarioName,
+    near,
+    number,
+    print_table,
+)
 from dnnmso_mj.cli.watching import LINE_PERIOD, how_to_go_on, terminated_like_ctrl_c
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from dnnmso_mj.tuning.run import Request, Tuned
+    from dnnmso_mj.tuning.run import Tuned
+    from dnnmso_mj.tuning.search import Request
 
 
 def tune(
-    scenario: Annotated[str, typer.Argument(help="A scenario file, or the name of a shipped one.")],
+    scenario: ScenarioName,
     controller: Annotated[
         str,
         typer.Option(metavar="KIND_OR_FILE", help="What is tuned, and where the search starts."),
@@ -44,18 +55,18 @@ def tune(
         float | None, typer.Option(help="Limit of tau_chatter (N·m a step).")
     ] = None,
     storage: Annotated[Path | None, typer.Option(help="Default OUT.study.sqlite.")] = None,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Runs at once; default all cores.")
-    ] = None,
-    resume: Annotated[bool, typer.Option(help="Go on with the study that is there.")] = False,
-    force: Annotated[bool, typer.Option(help="Start anew whatever is there.")] = False,
+    jobs: Jobs = None,
+    resume: Resume = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Search for a controller's best settings; the winner is a file for `controller: {from: …}`."""
     from dnnmso_mj.sweep.plan import parse_seeds
+    from dnnmso_mj.tuning import TuneInterrupted
     from dnnmso_mj.tuning.objective import Objective
-    from dnnmso_mj.tuning.run import Request, default_storage
+    from dnnmso_mj.tuning.run import default_storage
     from dnnmso_mj.tuning.run import tune as search
+    from dnnmso_mj.tuning.search import Request
 
     request = Request(
         source=scenario,
@@ -74,9 +85,9 @@ def tune(
                 done = search(
                     request, out, where, jobs=jobs, resume=resume, force=force, watcher=watch
                 )
-        except KeyboardInterrupt as stop:
+        except TuneInterrupted as stop:
             watch.stop()
-            raise KeyboardInterrupt(how_to_go_on(watch.done, trials, where, "trials")) from stop
+            raise KeyboardInterrupt(how_to_go_on(stop.done, trials, where, "trials")) from stop
     if as_json:
         print(json.dumps(_document(done, request), allow_nan=False))
     else:
@@ -89,15 +100,13 @@ class _Watch:
 
     name: str
     bar: Progress | None
-    done: int = 0
 
     def begin(self, total: int, kept: int) -> None:
-        self.done, self._total, self._said = kept, total, time.monotonic()
+        self._total, self._said = total, time.monotonic()
         if self.bar is not None:
             self._task = self.bar.add_task("", total=total, completed=kept, text=self.name)
 
     def trial(self, done: int, value: float, best: float) -> None:
-        self.done = done
         text = f"{self.name}: {done}/{self._total} trials, best {best:.4g}, last {value:.4g}"
         if self.bar is not None:
             self.bar.update(self._task, completed=done, text=text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Iterator, Sequence, Set
@@ -167,12 +168,14 @@ def plan_margins(
 
     Raises:
         ScenarioError: as `load_scenario`; the place of a controller is `--controllers NAME`.
-        MarginError: no controller, one twice, or a row that the scenario cannot have.
+        MarginError: no controller, one twice, a row that the scenario cannot have, or no limit.
     """
     twice = [name for k, name in enumerate(controllers) if name in controllers[:k]]
     if twice or not all(controllers) or not controllers:
         wrong = f"{clean(twice[0])} is there twice" if twice else "an empty name"
         raise MarginError(f"--controllers: {wrong}; allowed: each controller once, as in a,b,c")
+    if not 0.0 < limit < math.inf:
+        raise MarginError(f"--limit {limit:g}: allowed: a finite number above 0 (rad)")
     points: list[Cell] = []
     models: dict[str, Mjcf] = {}
     for name in controllers:

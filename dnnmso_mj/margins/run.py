@@ -62,8 +62,8 @@ class MarginResult:
 
 
 def default_out(plan: MarginPlan) -> Path:
-    """logs/NAME-margins.parquet under the current directory."""
-    return logs_dir() / f"{plan.points[0].scenario.name}-margins.parquet"
+    """logs/NAME.margins.parquet under the current directory."""
+    return logs_dir() / f"{plan.points[0].scenario.name}.margins.parquet"
 
 
 def run_margins(

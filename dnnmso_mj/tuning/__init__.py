@@ -11,3 +11,11 @@ from dnnmso_mj.errors import DnnmsoError
 
 class TuneError(DnnmsoError):
     """A tuning that cannot be accepted, gone on with or written."""
+
+
+class TuneInterrupted(KeyboardInterrupt):
+    """Ctrl-C during a tuning; the storage holds the first `done` trials."""
+
+    def __init__(self, done: int) -> None:
+        super().__init__(f"{done} trials are kept")
+        self.done = done

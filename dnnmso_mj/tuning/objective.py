@@ -26,7 +26,7 @@ class Objective:
 
         median over seeds of  rmse_steady √(1 + (tau_chatter / c₀)²)      (rad)
 
-    Where the worst run is over a limit: 1e6 (1 + its largest excess / that limit). Where runs
+    Where the worst run is over a limit, by the part x of it: 1e6 (1 + x / (1 + x)). Where runs
     diverge or fail: 1e9 (1 + mean over seeds of the part of the run that was lost). So trials
     without a good run are ordered too, by how near to one they come.
 
@@ -82,7 +82,7 @@ class Objective:
             _excess(rows, "tau_chatter", self.max_chatter),
         )
         if excess > 0.0:
-            return min(OVER_LIMIT * (1.0 + excess), LOST)
+            return OVER_LIMIT * (1.0 + excess / (1.0 + excess))
         return min(statistics.median(map(self._cost, rows)), OVER_LIMIT)
 
     def _cost(self, row: Row) -> float:
