@@ -16,7 +16,18 @@ from typing import Annotated, NoReturn
 import typer
 
 from dnnmso_mj import __version__
-from dnnmso_mj.cli import bench, check, compare, logs, run, scenarios, sweep, tune
+from dnnmso_mj.cli import (
+    bench,
+    check,
+    compare,
+    logs,
+    margins,
+    report,
+    run,
+    scenarios,
+    sweep,
+    tune,
+)
 from dnnmso_mj.cli.shared import BAD_INPUT, INTERRUPTED
 from dnnmso_mj.errors import DnnmsoError
 
@@ -136,7 +147,9 @@ def _root(
 app.command()(run.run)
 app.command()(sweep.sweep)
 app.command()(compare.compare)
+app.command()(margins.margins)
 app.command()(tune.tune)
+app.command()(report.report)
 app.command()(check.check)
 app.command()(logs.plot)
 app.command()(logs.replay)

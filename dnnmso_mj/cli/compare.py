@@ -21,6 +21,7 @@ from dnnmso_mj.cli.shared import (
     ScenarioName,
     near,
     number,
+    plain_spread,
     print_table,
     working,
 )
@@ -70,7 +71,7 @@ def compare(
         plan = plan_comparison(scenario, names, numbers, overrides or ())
     out = out or default_out(plan)
     engine, command = LocalEngine(jobs), shlex.join(["dnnmso", *sys.argv[1:]])
-    with watching(plan) as watcher:
+    with watching(plan.points[0].scenario.name) as watcher:
         try:
             with terminated_like_ctrl_c():
                 result = run_sweep(
@@ -98,7 +99,7 @@ def _document(
             "runs": standing.runs,
             "diverged": standing.count("diverged"),
             "failed": standing.count("failed"),
-            "metrics": {name: _plain(spread) for name, spread in standing.metrics.items()},
+            "metrics": {name: plain_spread(spread) for name, spread in standing.metrics.items()},
             "failures": [
                 {"seed": bad.seed, "status": bad.status, "reason": bad.reason}
                 for bad in standing.failures
@@ -106,7 +107,7 @@ def _document(
         }
         for rank, standing in enumerate(found.standings, start=1)
     ]
-    pairings = [vars(item) | {"log_ratio": _plain(item.log_ratio)} for item in found.pairings]
+    pairings = [vars(item) | {"log_ratio": plain_spread(item.log_ratio)} for item in found.pairings]
     return {
         "status": "completed",
         "scenario": scenario,
@@ -119,12 +120,6 @@ def _document(
         "standings": standings,
         "pairings": pairings,
     }
-
-
-def _plain(spread: Spread) -> dict[str, Any]:
-    """JSON has no infinity: "inf" and "-inf" are texts in it."""
-    endless = {math.inf: "inf", -math.inf: "-inf"}
-    return {name: endless.get(value, value) for name, value in vars(spread).items()}
 
 
 def _print(found: Comparison, result: SweepResult, scenario: str) -> None:

@@ -65,7 +65,7 @@ def sweep(
         plan = plan_sweep(scenario, parse_seeds(seeds), overrides or (), grid or ())
     out = out or default_out(plan)
     command = shlex.join(["dnnmso", *sys.argv[1:]])
-    with watching(plan) as watcher:
+    with watching(plan.points[0].scenario.name) as watcher:
         try:
             with terminated_like_ctrl_c():
                 result = run_sweep(

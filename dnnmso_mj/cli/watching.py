@@ -16,20 +16,24 @@ from dnnmso_mj.cli.shared import near
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from dnnmso_mj.sweep.plan import Plan
     from dnnmso_mj.sweep.task import Row
 
 LINE_PERIOD = 30.0  # s between lines of progress where there is no terminal
 
 
 class Watch:
-    """Counts rows, and shows the count: a bar on a terminal, else a line now and then."""
+    """Counts rows, and shows the count: a bar on a terminal, else a line now and then.
 
-    def __init__(self, plan: Plan, bar: Progress | None) -> None:
-        self._name = plan.points[0].scenario.name
-        self._bar = bar
+    Args:
+        name: of what is run.
+        bar: None without a terminal.
+        bad: statuses of rows that are counted as gone wrong.
+    """
+
+    def __init__(self, name: str, bar: Progress | None, bad: tuple[str, ...]) -> None:
+        self._name, self._bar, self._bad = name, bar, bad
         self.done, self.failures = 0, 0
-        self._total, self._kept, self._ticks = plan.n_runs, 0, 0
+        self._total, self._kept, self._ticks = 0, 0, 0
         self._started = self._said = time.monotonic()
 
     def begin(self, total: int, kept: int) -> None:
@@ -41,7 +45,7 @@ class Watch:
 
     def row(self, row: Row) -> None:
         self.done += 1
-        self.failures += row["status"] != "ok"
+        self.failures += row["status"] in self._bad
         self._ticks += row["ticks"]
         if self._bar is not None:
             self._bar.update(self._task, completed=self.done, text=self._text())
@@ -59,7 +63,7 @@ class Watch:
         rates = (
             f"{(self.done - self._kept) / passed:.3g} runs/s, {self._ticks / passed:,.0f} ticks/s"
         )
-        bad = f", {self.failures} diverged or failed" if self.failures else ""
+        bad = f", {self.failures} {' or '.join(self._bad)}" if self.failures else ""
         return f"{self._name}: {self.done}/{self._total} runs, {rates}{bad}"
 
     def _left(self) -> str:
@@ -69,18 +73,18 @@ class Watch:
 
 
 @contextmanager
-def watching(plan: Plan) -> Iterator[Watch]:
-    """A watcher of a sweep, its bar taken away at the end."""
+def watching(name: str, bad: tuple[str, ...] = ("diverged", "failed")) -> Iterator[Watch]:
+    """A watcher of many runs, its bar taken away at the end; see `Watch`."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True, markup=False)
     if not console.is_terminal:
-        yield Watch(plan, None)
+        yield Watch(name, None, bad)
         return
     columns = (TextColumn("{task.fields[text]}", markup=False), BarColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as bar:
-        yield Watch(plan, bar)
+        yield Watch(name, bar, bad)
 
 
 @contextmanager

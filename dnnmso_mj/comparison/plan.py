@@ -66,7 +66,7 @@ def plan_comparison(
             raise ComparisonError(f"{where}, as --controllers does; allowed: --controllers alone")
     ordered = ordered_seeds(seeds)
     models: dict[str, Mjcf] = {}
-    points = [_point(source, name, sets, models) for name in controllers]
+    points = [controller_point(source, name, sets, models) for name in controllers]
     return Plan(str(source), ordered, tuple(points))
 
 
@@ -75,7 +75,20 @@ def default_out(plan: Plan) -> Path:
     return logs_dir() / f"{plan.points[0].scenario.name}.compare.parquet"
 
 
-def _point(source: str | Path, name: str, sets: Sequence[str], models: dict[str, Mjcf]) -> Point:
+def controller_point(
+    source: str | Path, name: str, sets: Sequence[str], models: dict[str, Mjcf]
+) -> Point:
+    """A scenario with a controller in its place, checked down to its first tick.
+
+    Args:
+        source: a scenario file, or the name of a shipped one.
+        name: of a shipped tuned controller, a kind (its defaults), or a file.
+        sets: "a.b=c", put in afterwards.
+        models: those read before, by name; a new one is added.
+
+    Raises:
+        ScenarioError: as `load_scenario`; the place of the controller is `--controllers NAME`.
+    """
     place = f"--controllers {clean(name)}"
     try:
         chosen = controller_set(name)

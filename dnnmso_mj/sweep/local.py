@@ -20,7 +20,7 @@ from typing import Self
 
 from dnnmso_mj.sources import python_path
 from dnnmso_mj.sweep.plan import SweepError
-from dnnmso_mj.sweep.task import Row, Task, failed_row
+from dnnmso_mj.sweep.task import Row, Work, failed_row
 
 # The cores are shared out by the sweep; a library's own threads would only fight for them.
 ONE_THREAD = dict.fromkeys(
@@ -40,7 +40,7 @@ class LocalEngine:
     def __init__(self, jobs: int | None = None) -> None:
         self.jobs = jobs or len(os.sched_getaffinity(0))
 
-    def rows(self, tasks: Iterable[Task]) -> Generator[Row]:
+    def rows(self, tasks: Iterable[Work]) -> Generator[Row]:
         """Yield every run's row as it is finished; closing the generator ends the workers.
 
         A run whose process dies is tried once more, after all others; if that dies too, its row
@@ -71,7 +71,7 @@ class WorkerPool:
     def __exit__(self, *_error: object) -> None:
         self.kill()
 
-    def rows(self, tasks: Iterable[Task]) -> Generator[Row]:
+    def rows(self, tasks: Iterable[Work]) -> Generator[Row]:
         """Yield every run's row as it is finished; see `LocalEngine.rows`.
 
         Closing the generator before its end ends the workers; the next call starts others.
@@ -98,10 +98,10 @@ class WorkerPool:
             worker.kill()
         self._workers.clear()
 
-    def _begin(self, tasks: Iterable[Task]) -> None:
+    def _begin(self, tasks: Iterable[Work]) -> None:
         self._tasks = iter(tasks)
-        self._rest: deque[Task] = deque()  # of tasks whose process died
-        self._again: deque[Task] = deque()  # runs that were under way when it did
+        self._rest: deque[Work] = deque()  # of tasks whose process died
+        self._again: deque[Work] = deque()  # runs that were under way when it did
         self._suspects: set[tuple[int, int]] = set()
 
     def _listen(self, worker: _Worker) -> Iterator[Row]:
@@ -139,7 +139,7 @@ class WorkerPool:
         if task is not None:
             worker.give(task)
 
-    def _next(self) -> Task | None:
+    def _next(self) -> Work | None:
         if self._rest:
             return self._rest.popleft()
         task = next(self._tasks, None)
@@ -164,8 +164,8 @@ class WorkerPool:
 class _Worker:
     """One process, its task, and the seeds of it whose rows are still to come."""
 
-    def __init__(self, first: Task) -> None:
-        self.first: Task | None = first  # for when it is ready
+    def __init__(self, first: Work) -> None:
+        self.first: Work | None = first  # for when it is ready
         self.task = first
         self.seeds: deque[int] = deque()
         self.ready = False
@@ -187,7 +187,7 @@ class _Worker:
         """Whether it has something to say before it is given more to do."""
         return bool(self.seeds) or not self.ready
 
-    def give(self, task: Task) -> None:
+    def give(self, task: Work) -> None:
         self.task, self.seeds = task, deque(task.seeds)
         with suppress(OSError):  # it is dead, as the next message will tell
             self.pipe.send(task)

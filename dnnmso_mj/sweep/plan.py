@@ -89,7 +89,6 @@ class Plan:
 
     def definition(self) -> dict[str, Any]:
         """Everything but the seeds that the numbers depend on, as JSON."""
-        versions = software_versions()
         points = [
             {
                 "parameters": point.parameters,
@@ -100,10 +99,18 @@ class Plan:
         return {
             "points": points,
             "models": {p.scenario.plant.model: p.mjcf.text for p in self.points},
-            "versions": {name: versions[name] for name in NUMBERS_DEPEND_ON},
-            "git_commit": git_commit(),
-            "source_sha256": sources_digest(),
+            **code_identity(),
         }
+
+
+def code_identity() -> dict[str, Any]:
+    """Which code the numbers of this installation come from."""
+    versions = software_versions()
+    return {
+        "versions": {name: versions[name] for name in NUMBERS_DEPEND_ON},
+        "git_commit": git_commit(),
+        "source_sha256": sources_digest(),
+    }
 
 
 def plan_sweep(
