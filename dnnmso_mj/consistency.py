@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from dnnmso_mj.scenario.controller import effectiveness, inversion
+
 if TYPE_CHECKING:
     from dnnmso_mj.scenario import Scenario
 
@@ -20,6 +22,7 @@ def contradictions(scenario: Scenario) -> list[Problem]:
         *_times_below_dt(scenario),
         *_observer_gain(scenario),
         *_stalls(scenario),
+        *_events(scenario),
         *_sizes(scenario),
     ]
 
@@ -51,6 +54,8 @@ def _times_below_dt(scenario: Scenario) -> Iterator[Problem]:
 
 def _observer_gain(scenario: Scenario) -> Iterator[Problem]:
     most = 2.0 / scenario.dt
+    if not hasattr(scenario.controller, "observer"):
+        return
     if max(scenario.controller.observer.K2) >= most:
         problem = f"makes a sampled observer unstable; allowed: K2 < 2/dt = {most:g}"
         yield "controller.observer.K2", problem
@@ -61,6 +66,15 @@ def _stalls(scenario: Scenario) -> Iterator[Problem]:
         if stall.at > scenario.duration - 0.5 * scenario.dt:
             yield (
                 f"real_time.stalls.{k}.at",
+                f"is at the end or after it; allowed: below {scenario.duration:g} s",
+            )
+
+
+def _events(scenario: Scenario) -> Iterator[Problem]:
+    for k, event in enumerate(scenario.events):
+        if event.at > scenario.duration - 0.5 * scenario.dt:
+            yield (
+                f"events.{k}.at",
                 f"is at the end or after it; allowed: below {scenario.duration:g} s",
             )
 
@@ -80,18 +94,27 @@ def _vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:
     if scenario.plant.masses:
         yield "plant.masses", len(scenario.plant.masses), {n}
     yield from _reference_vectors(scenario, n)
-    inversion = scenario.controller.inversion
-    yield "controller.inversion.K", len(inversion.K), {1, 2 * n}
-    if inversion.slack_matrix:
-        yield "controller.inversion.slack_matrix", len(inversion.slack_matrix), {2 * n}
-    if inversion.effectiveness.kind == "inertia":
-        for name in ("masses", "lengths"):
-            values = getattr(inversion.effectiveness, name)
-            if values:
-                yield f"controller.inversion.effectiveness.{name}", len(values), {n}
-    yield "controller.observer.K2", len(scenario.controller.observer.K2), {1, 2 * n}
+    yield from _controller_vectors(scenario, n)
     if scenario.imperfections.torque_limit:
         yield "imperfections.torque_limit", len(scenario.imperfections.torque_limit), {1, n}
+
+
+def _controller_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:
+    controller, path = scenario.controller, "controller"
+    law = inversion(controller)
+    if law is not None:
+        path = "controller.inversion"
+        yield f"{path}.K", len(law.K), {1, 2 * n}
+        if law.slack_matrix:
+            yield f"{path}.slack_matrix", len(law.slack_matrix), {2 * n}
+    believed = effectiveness(controller)
+    if believed.kind == "inertia":
+        for name in ("masses", "lengths"):
+            values = getattr(believed, name)
+            if values:
+                yield f"{path}.effectiveness.{name}", len(values), {n}
+    if hasattr(controller, "observer"):
+        yield "controller.observer.K2", len(controller.observer.K2), {1, 2 * n}
 
 
 def _reference_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.inversion import DynamicInversion, solve_spd
 from dnnmso_mj.scenario import Observer as ObserverSpec
 from dnnmso_mj.scenario import expand
 
@@ -27,19 +28,50 @@ class StateObserver(NamedTuple):
     e_obs: Array  # e_a (2n,) of the last `compare`
     gain: Array  # K₂ (2n,) with the sign of its feedback
     dt: float  # s
+    applied: bool  # whether it hears of the torque that acted, or takes its command for that
+    free: Array  # (n,) scratch
+    change: Array  # (n,) scratch
+    L: Array  # (n, n) scratch
 
 
 def build_observer(spec: ObserverSpec, n_states: int, dt: float) -> StateObserver:
     """The observer of a scenario for 2n states and control period dt (s)."""
     sign = 1.0 if spec.feedback == "stable" else -1.0
     gain = sign * expand(spec.K2, n_states)
-    return StateObserver(np.zeros(n_states), np.zeros(n_states), gain, dt)
+    n = n_states // 2
+    return StateObserver(
+        x_hat=np.zeros(n_states),
+        e_obs=np.zeros(n_states),
+        gain=gain,
+        dt=dt,
+        applied=spec.torque == "applied",
+        free=np.zeros(n),
+        change=np.zeros(n),
+        L=np.zeros((n, n)),
+    )
 
 
 @compiled
 def start(observer: StateObserver, x: Array) -> None:
     """Start at the measured state x (2n,): X̂₀ = X₀ (the paper's simulation section)."""
     copy(x, observer.x_hat)
+
+
+@inner
+def correct(observer: StateObserver, inversion: DynamicInversion, tau: Array) -> None:
+    """Put the torque that acted in the last period in the place of the one commanded for it.
+
+    X̂ ← X̂ + dt B (τ − u) for τ (n,) N·m as the drives report it, and B of the last command. Without
+    this a saturated actuator looks like dynamics to learn (windup).
+    """
+    n = tau.size
+    if not observer.applied:
+        return
+    for i in range(n):
+        observer.free[i] = tau[i] - inversion.tau[i]
+    solve_spd(inversion.B2_inv, observer.free, observer.change, observer.L)
+    for i in range(n):
+        observer.x_hat[n + i] += observer.dt * observer.change[i]
 
 
 @inner

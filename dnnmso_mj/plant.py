@@ -35,6 +35,7 @@ from dnnmso_mj.mujoco_calls import (
 )
 from dnnmso_mj.scenario import Inertia, Scenario
 from dnnmso_mj.scenario import Plant as PlantSpec
+from dnnmso_mj.scenario.controller import effectiveness
 from dnnmso_mj.unmodelled import refuse_unmodelled
 
 Array = np.ndarray
@@ -294,8 +295,8 @@ class NominalModel:
     """
 
     def __init__(self, scenario: Scenario, mjcf: Mjcf) -> None:
-        effectiveness = scenario.controller.inversion.effectiveness
-        known = effectiveness if isinstance(effectiveness, Inertia) else None
+        believed = effectiveness(scenario.controller)
+        known = believed if isinstance(believed, Inertia) else None
         self.model = deepcopy(_nominal_model(scenario.plant, known, scenario.dt, mjcf))
         data = self._data = mujoco.MjData(self.model)
         self.view = Nominal(

@@ -15,12 +15,21 @@ from numba.core import event
 
 from dnnmso_mj.compile_loop import compile_elsewhere
 from dnnmso_mj.compiling import CompileNotice
-from dnnmso_mj.controllers import Controller, build_controller, compiled_ticks
+from dnnmso_mj.controllers import (
+    LEARNING,
+    MODEL_ALONE,
+    MODEL_FROZEN,
+    Controller,
+    Inputs,
+    build_controller,
+    compiled_ticks,
+)
 from dnnmso_mj.errors import NonFiniteError
 from dnnmso_mj.imperfections import build_actuators
 from dnnmso_mj.plant import RK4, Mjcf, NominalModel, Plant
 from dnnmso_mj.reference import Reference
 from dnnmso_mj.scenario import Constant, Scenario
+from dnnmso_mj.scenario.controller import effectiveness, inversion, lookahead
 from dnnmso_mj.theory import build_bounds, start_bounds
 from dnnmso_mj.tick import (
     CHUNK_START,
@@ -103,26 +112,28 @@ class Simulation:
         self.layout = StepLayout(n, self.controller.n_layers)
         self._columns = {name: self.layout.slices[name].start for name in CHANGES}
         self._nominal = NominalModel(scenario, mjcf)
-        effectiveness = scenario.controller.inversion.effectiveness
+        believed, law = effectiveness(scenario.controller), inversion(scenario.controller)
         bounds = build_bounds(
-            scenario.controller.inversion,
+            law,
             n,
             scenario.dt,
             first_order=self.plant.view.integrator != RK4,
         )
-        q_ref, qd_ref, qdd_ref = np.zeros((3, CHUNK, n))
+        self._events = sorted(scenario.events, key=lambda event: event.at)
+        self._lookahead = lookahead(scenario.controller)
+        reference = np.zeros((CHUNK, 3 * n))
         x, x_ref, xd_ref, e_track, f_true, f_err = np.zeros((6, 2 * n))
         self.world = World(
             plant=self.plant.view,
             actuators=build_actuators(scenario.imperfections, n),
             bounds=bounds,
             pace=pace,
-            q_ref=q_ref,
-            qd_ref=qd_ref,
-            qdd_ref=qdd_ref,
+            reference=reference,
+            ahead=np.zeros_like(reference) if self._lookahead else reference,
             x=x,
             x_ref=x_ref,
             xd_ref=xd_ref,
+            inputs=Inputs.zeros(n),
             e_track=e_track,
             f_true=f_true,
             f_err=f_err,
@@ -130,7 +141,8 @@ class Simulation:
             qdd=np.zeros(n),
             L=np.zeros((n, n)),
             nominal=self._nominal.view,
-            b=effectiveness.b if isinstance(effectiveness, Constant) else 0.0,
+            b=believed.b if isinstance(believed, Constant) else 0.0,
+            inverts=law is not None,
             rows=np.zeros((LARGEST_BLOCK, self.layout.width)),
             counts=np.zeros(N_COUNTS, np.int64),
             late_ns=np.zeros(1, np.int64),
@@ -184,7 +196,7 @@ class Simulation:
                 state, world = self.controller.state(), self.world
                 self._start()
                 begin_tick(world, 0)
-                self._command = self.controller.update(world.x, world.x_ref, world.xd_ref)
+                self._command = self.controller.update(world.inputs)
                 end_tick(world, self._command, 0)
                 self.controller.restore(state)
         self._start()
@@ -198,6 +210,8 @@ class Simulation:
         q_ref, qd_ref, _ = self.reference.sample(np.zeros(1))
         start_bounds(world.bounds, x - np.concatenate([q_ref[0], qd_ref[0]]))
         world.tau[:] = 0.0
+        world.inputs.frozen[0] = LEARNING
+        self._happened = 0
         world.counts[:] = 0
         self._sample_reference(0)
         self._flags = dict.fromkeys(CHANGES, False)
@@ -213,7 +227,7 @@ class Simulation:
                 recorder.snapshot("controller", first * dt, self.controller.state())
             if first % CHUNK == 0 and first > 0:
                 self._sample_reference(first)
-            ends = [first + block, n_ticks]
+            ends = [first + block, n_ticks, self._happen(first, recorder)]
             ends += [(first // every + 1) * every for every in (CHUNK, snapshot_every)]
             count = min(ends) - first
             self._run_block(first, count, recorder)
@@ -221,11 +235,26 @@ class Simulation:
                 progress(count)
         recorder.snapshot("controller", n_ticks * dt, self.controller.state())
 
+    def _happen(self, tick: int, recorder: Recorder) -> int:
+        """Let every event up to this tick happen; the tick of the next one, or the last."""
+        dt = self.scenario.dt
+        for wanted in self._events[self._happened :]:
+            due = round(wanted.at / dt)
+            if due > tick:
+                return due
+            self._happened += 1
+            self.world.inputs.frozen[0] = MODEL_FROZEN if wanted.what == "model" else MODEL_ALONE
+            left = "" if wanted.what == "model" else ", and no disturbance is estimated"
+            recorder.event(Event(tick * dt, "info", f"learning ends{left}"))
+        return self.scenario.n_ticks
+
     def _sample_reference(self, first: int) -> None:
         world = self.world
         world.counts[CHUNK_START] = first
         t = np.arange(first, first + CHUNK) * self.scenario.dt
-        world.q_ref[:], world.qd_ref[:], world.qdd_ref[:] = self.reference.sample(t)
+        world.reference[:] = np.hstack(self.reference.sample(t))
+        if self._lookahead:
+            world.ahead[:] = np.hstack(self.reference.sample(t + self._lookahead))
 
     def _run_block(self, first: int, count: int, recorder: Recorder) -> None:
         """Ticks first to first + count, and their rows to the recorder.
@@ -254,7 +283,7 @@ class Simulation:
         for k in range(first, first + count):
             if begin_tick(world, k):
                 began = time.perf_counter_ns()
-                self._command = self.controller.update(world.x, world.x_ref, world.xd_ref)
+                self._command = self.controller.update(world.inputs)
                 world.counts[TOOK_NS] = time.perf_counter_ns() - began
             if end_tick(world, self._command, k):
                 return

@@ -76,7 +76,7 @@ class TrackingBounds(NamedTuple):
     """
 
     joint: Array  # (1,) bound on every |q_i − q_ref,i| (rad), or −1 where K or Λ is not scalar
-    paper: Array  # (1,) the paper's bound on ‖e_r‖
+    paper: Array  # (1,) the paper's bound on ‖e_r‖, or −1 without an inversion
     s: Array  # (1,) bound on ‖ė + λe‖
     norms: Array  # (2,) ‖d‖ and ‖f̃‖ at the period's begin
     qdd: Array  # (n,) rad/s² at the period's begin
@@ -87,10 +87,14 @@ class TrackingBounds(NamedTuple):
 
 
 def build_bounds(
-    spec: InversionSpec, n_joints: int, dt: float, *, first_order: bool
+    spec: InversionSpec | None, n_joints: int, dt: float, *, first_order: bool
 ) -> TrackingBounds:
-    """Bounds for the inversion's K and slack matrix; `start_bounds` comes next."""
+    """Bounds for the inversion's K and slack matrix, none for another law; then `start_bounds`."""
     n = n_joints
+    if spec is None:
+        return build_bounds(InversionSpec(), n, dt, first_order=first_order)._replace(
+            joint=np.full(1, UNDEFINED), paper=np.full(1, UNDEFINED)
+        )
     K, coupling = expand(spec.K, 2 * n), slack_coupling(slack_matrix(spec, n))
     gain, lam = float(K[0]), float(coupling[0, 0])
     scalar = bool(np.ptp(K) == 0 and np.array_equal(coupling, lam * np.eye(n)))
@@ -113,7 +117,8 @@ def start_bounds(bounds: TrackingBounds, e_track: Array) -> None:
     if bounds.joint[0] != UNDEFINED:
         bounds.joint[0] = np.linalg.norm(e_track[:n])
     bounds.s[0] = np.linalg.norm(e_track[n:] + lam * e_track[:n])
-    bounds.paper[0] = np.linalg.norm(e_track)
+    if bounds.paper[0] != UNDEFINED:
+        bounds.paper[0] = np.linalg.norm(e_track)
 
 
 @inner
@@ -150,7 +155,9 @@ def end_period(bounds: TrackingBounds, e_track: Array, qdd: Array, qdd_ref: Arra
 
     ‖d‖ in between is at most the mean of both ends, but for terms of order dt².
     """
-    bounds.paper[0] = bounds.holds[2, 0] * bounds.paper[0] + bounds.holds[2, 1] * bounds.norms[1]
+    if bounds.paper[0] != UNDEFINED:
+        decay, gain = bounds.holds[2]
+        bounds.paper[0] = decay * bounds.paper[0] + gain * bounds.norms[1]
     if bounds.joint[0] == UNDEFINED:
         return
     n, dt = qdd.size, bounds.dt

@@ -25,10 +25,10 @@ from dnnmso_mj.plant import Nominal, PlantView, forward, inertia, integrate, sol
 from dnnmso_mj.theory import TrackingBounds, begin_period, end_period
 
 if TYPE_CHECKING:
-    from dnnmso_mj.controllers import Command
+    from dnnmso_mj.controllers import Command, Inputs
 
 Array = np.ndarray
-Update = Callable[[Any, Array, Array, Array], None]
+Update = Callable[[Any, "Inputs"], None]
 Loop = Callable[["World", Any, int, int], int]
 
 # rad, rad/s: no arm is there and comes back.
@@ -62,12 +62,12 @@ class World(NamedTuple):
     actuators: Actuators
     bounds: TrackingBounds
     pace: Pace
-    q_ref: Array  # (chunk, n), and its derivatives
-    qd_ref: Array
-    qdd_ref: Array
-    x: Array  # (2n,)
+    reference: Array  # (chunk, 3n): q_ref, q̇_ref and q̈_ref of each tick,
+    ahead: Array  # and what the controller reads of it, some time ahead of the tick
+    x: Array  # (2n,) the true state
     x_ref: Array  # (2n,)
     xd_ref: Array  # (2n,)
+    inputs: Inputs  # what the controller is told
     e_track: Array  # (2n,)
     f_true: Array  # (2n,)
     f_err: Array  # (2n,) what the closed loop feels of f̃, saturation included
@@ -76,6 +76,7 @@ class World(NamedTuple):
     L: Array  # (n, n) scratch
     nominal: Nominal  # what the controller takes for the robot: B₂ = M(q)⁻¹,
     b: float  # or b·I where this is positive
+    inverts: bool  # whether the controller has worked out B τ for its command
     rows: Array  # (block, width): `trace.StepLayout`
     counts: Array  # int64, see above
     late_ns: Array  # (1,) int64, of this tick's wake-up
@@ -84,7 +85,7 @@ class World(NamedTuple):
 
 
 def closed_loop(update: Update) -> Loop:
-    """Compile the whole loop around a controller's `update(parts, x, x_ref, xd_ref)`.
+    """Compile the whole loop around a controller's `update(parts, inputs)`.
 
     `update` is an `inner` function, and its parts have a field `command`. The loop takes (world,
     parts, first, count), runs ticks first to first + count, and returns how many were done.
@@ -102,14 +103,14 @@ def _run_ticks(world: World, parts: Any, first: int, count: int) -> int:
     for k in range(first, first + count):
         if begin_tick(world, k):
             began = now_ns(world.timespec)
-            update(parts, world.x, world.x_ref, world.xd_ref)
+            update(parts, world.inputs)
             world.counts[TOOK_NS] = now_ns(world.timespec) - began
         if end_tick(world, parts.command, k):
             return k + 1 - first
     return count
 
 
-def update(parts: Any, x: Array, x_ref: Array, xd_ref: Array) -> None:
+def update(parts: Any, inputs: Inputs) -> None:
     """What `closed_loop` puts a controller's law in the place of."""
 
 
@@ -120,13 +121,15 @@ def begin_tick(world: World, k: int) -> bool:
     world.late_ns[0] = 0
     in_time = world.pace.period_ns == 0 or _wait(world, k)
     world.counts[CONTROLLED] = 1 if in_time else 0
-    n, plant = world.tau.size, world.plant
+    n, plant, inputs = world.tau.size, world.plant, world.inputs
     i = k - world.counts[CHUNK_START]
     for j in range(n):
         world.x[j], world.x[n + j] = plant.q[j], plant.qd[j]
-        world.x_ref[j], world.x_ref[n + j] = world.q_ref[i, j], world.qd_ref[i, j]
-        world.xd_ref[j], world.xd_ref[n + j] = world.qd_ref[i, j], world.qdd_ref[i, j]
+        inputs.tau[j] = world.tau[j]
     for j in range(2 * n):
+        inputs.x[j] = world.x[j]
+        world.x_ref[j], world.xd_ref[j] = world.reference[i, j], world.reference[i, n + j]
+        inputs.x_ref[j], inputs.xd_ref[j] = world.ahead[i, j], world.ahead[i, n + j]
         world.e_track[j] = world.x[j] - world.x_ref[j]
     return in_time
 
@@ -239,6 +242,8 @@ def _effect(world: World, tau: Array, out: Array) -> None:
 def _true_dynamics(world: World, command: Command, tau: Array, substituted: bool) -> None:
     """f_true = Ẋ − B τ, and what the closed loop feels of it, f_err = Ẋ − B τ_cmd − f̂."""
     n = tau.size
+    if not world.inverts:
+        _effect(world, command.tau, command.Bu[n:])
     for j in range(n):
         world.f_true[j], world.f_true[n + j] = world.x[n + j], world.plant.qacc[j]
     for j in range(2 * n):
@@ -262,7 +267,7 @@ def fill(world: World, command: Command, k: int, saturated: bool, missed: bool, 
     lyapunov = 0.0
     for j in range(states):
         row[1 + j] = world.x[j]
-        row[1 + states + j] = world.x[j]  # the sensors are perfect
+        row[1 + states + j] = world.inputs.x[j]
         row[1 + 2 * states + j] = world.x_ref[j]
         row[learned + j] = command.x_hat[j]
         row[learned + states + j] = command.f_hat[j]

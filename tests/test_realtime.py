@@ -136,11 +136,11 @@ class Dozing:
     def __getattr__(self, name):
         return getattr(self._controller, name)
 
-    def update(self, x, x_ref, xd_ref):
+    def update(self, inputs):
         self._k += 1
         if self._k in self._updates:
             time.sleep(0.05)
-        return self._controller.update(x, x_ref, xd_ref)
+        return self._controller.update(inputs)
 
 
 def test_a_controller_that_overruns_is_found_out_in_an_interpreted_loop_too(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dnnmso_mj.controllers import Inputs
 from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.learner import KernelLearner, build_learner
 from dnnmso_mj.metrics import compute_metrics
@@ -94,7 +95,7 @@ def test_classical_mso_takes_one_step_of_eq_4(make_scenario, two_link):
 
     x_hat, x, x_ref, xd_ref = np.random.default_rng(1).normal(size=(4, 4))
     controller.reset(x_hat)
-    command = controller.update(x, x_ref, xd_ref)
+    command = controller.update(Inputs.zeros(2)._replace(x=x, x_ref=x_ref, xd_ref=xd_ref))
     B2 = np.linalg.inv(arm.inertia(x[:2]))
     d_hat, e_obs = twin.predict(x), x - x_hat
     learned = np.concatenate([np.zeros(2), B2 @ d_hat])

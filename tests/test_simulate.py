@@ -8,6 +8,7 @@ from multiprocessing import get_context
 import numpy as np
 import pytest
 
+from dnnmso_mj.controllers import Inputs
 from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.metrics import compute_metrics
@@ -188,12 +189,17 @@ def test_a_controller_restored_from_its_state_commands_the_same_torque(
     other = Simulation(scenario.model_copy(update={"seed": 9}), two_link).controller
     states = np.random.default_rng(0).normal(size=(30, 3, 4))
     one.reset(states[0, 0])
-    for x, x_ref, xd_ref in states[:15]:
-        one.update(x, x_ref, xd_ref)
+    for each in states[:15]:
+        one.update(told(*each))
     other.restore(one.state())
-    for x, x_ref, xd_ref in states[15:]:
-        expected = one.update(x, x_ref, xd_ref).tau.copy()
-        assert np.array_equal(other.update(x, x_ref, xd_ref).tau, expected)
+    for each in states[15:]:
+        expected = one.update(told(*each)).tau.copy()
+        assert np.array_equal(other.update(told(*each)).tau, expected)
+
+
+def told(x, x_ref, xd_ref) -> Inputs:
+    """What a controller is told at a measured state and a reference."""
+    return Inputs.zeros(x.size // 2)._replace(x=x, x_ref=x_ref, xd_ref=xd_ref)
 
 
 def chain(n: int) -> Mjcf:
@@ -240,8 +246,8 @@ class Faulty:
     def __getattr__(self, name):
         return getattr(self._controller, name)
 
-    def update(self, x, x_ref, xd_ref):
-        command = self._controller.update(x, x_ref, xd_ref)
+    def update(self, inputs):
+        command = self._controller.update(inputs)
         if self._k == self._tick:
             command.tau[1] = self._value
         self._k += 1
@@ -284,3 +290,45 @@ def test_weights_that_are_not_finite_are_named(make_scenario, two_link, backend)
     assert info.status == "diverged"
     assert "weights" in info.reason
     assert info.reason.endswith("at t = 0 s")
+
+
+def weights_of(scenario, mjcf) -> tuple[Trace, np.ndarray]:
+    simulation = Simulation(scenario, mjcf)
+    recorder = MemoryRecorder(simulation.layout, scenario.n_ticks)
+    trace = recorder.trace(scenario, simulation.run(recorder))
+    return trace, simulation.controller.state()["weights"]
+
+
+@pytest.mark.parametrize("kind", ["dnn_mso", "classical_mso"])
+def test_frozen_weights_stay_as_they_are_and_the_log_says_since_when(make_scenario, two_link, kind):
+    freeze = [{"kind": "freeze", "at": 0.3}]
+    short, at_freeze = weights_of(make_scenario({"kind": kind}, duration=0.3), two_link)
+    frozen, after = weights_of(make_scenario({"kind": kind}, duration=0.6, events=freeze), two_link)
+    _, learning = weights_of(make_scenario({"kind": kind}, duration=0.6), two_link)
+    assert np.array_equal(after, at_freeze)
+    assert not np.array_equal(learning, at_freeze)
+    assert np.array_equal(frozen["q"][:300], short["q"])
+    assert [(event.t, event.message) for event in frozen.events] == [(0.3, "learning ends")]
+
+
+def test_an_observer_that_hears_of_the_applied_torque_does_not_wind_up(make_scenario, two_link):
+    def error(torque: str, limit: float | None) -> Trace:
+        controller = {"kind": "dnn_mso", "observer": {"torque": torque}}
+        limits = {"torque_limit": limit}
+        return simulate(make_scenario(controller, imperfections=limits, duration=4.0), two_link)
+
+    free = [error(torque, None) for torque in ("commanded", "applied")]
+    assert np.array_equal(free[0]["q"], free[1]["q"])
+    limited = [error(torque, 40.0) for torque in ("commanded", "applied")]
+    assert all(trace["saturated"].any() for trace in limited)
+    wound, heard = (np.median(np.abs(trace["f_true"] - trace["f_hat"])) for trace in limited)
+    assert heard < 0.5 * wound
+
+
+def test_the_predicted_dynamics_are_what_the_log_says_the_network_learned(make_scenario, two_link):
+    for kind in ("dnn_mso", "classical_mso"):
+        simulation = Simulation(make_scenario({"kind": kind}), two_link)
+        x, x_ref, xd_ref = np.random.default_rng(0).normal(size=(3, 4))
+        predicted = simulation.controller.dynamics(x)
+        command = simulation.controller.update(told(x, x_ref, xd_ref))
+        assert np.allclose(predicted, command.f_hat[2:], rtol=1e-12)

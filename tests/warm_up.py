@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dnnmso_mj.controllers import Inputs
 from dnnmso_mj.learner import build_learner
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.paths import find_model
@@ -25,7 +26,7 @@ def main() -> None:
         scenario = load_scenario(name, [*sets, "duration=0.01"])
         simulate(scenario)
         simulation = Simulation(scenario, Mjcf.read(find_model(scenario.plant.model)))
-        simulation.controller.update(*np.zeros((3, 2 * scenario.n_joints)))
+        simulation.controller.update(Inputs.zeros(scenario.n_joints))
     for precision in ("float32", "float64"):
         learner = build_learner(Network(precision=precision), Madam(), 4, 4, 0)
         learner.predict(np.zeros(4))

@@ -18,6 +18,28 @@ if TYPE_CHECKING:
 Array = np.ndarray
 
 
+# Values of `Inputs.frozen`.
+LEARNING = 0
+MODEL_FROZEN = 1  # weights and adapted parameters stay as they are
+MODEL_ALONE = 2  # and what estimates the disturbance of the moment is left out
+
+
+class Inputs(NamedTuple):
+    """What a controller is told in one tick; arrays, overwritten by the loop before the next."""
+
+    x: Array  # what the sensors say of [q; q̇] (2n,)
+    tau: Array  # what the drives say acted in the period before (n,) N·m; zero before the first
+    x_ref: Array  # reference (2n,), of `lookahead` s ahead of the tick
+    xd_ref: Array  # its derivative [q̇_ref; q̈_ref] (2n,)
+    frozen: Array  # (1,) int64, one of the above
+
+    @classmethod
+    def zeros(cls, n_joints: int) -> Inputs:
+        """All zero, and learning."""
+        x, x_ref, xd_ref = np.zeros((3, 2 * n_joints))
+        return cls(x, np.zeros(n_joints), x_ref, xd_ref, np.zeros(1, np.int64))
+
+
 class Command(NamedTuple):
     """What a controller decided in one tick, and what is worth logging of it.
 
@@ -67,8 +89,11 @@ class Controller(Protocol):
     def reset(self, x: Array) -> None:
         """Start from the measured state x = [q; q̇] (2n,)."""
 
-    def update(self, x: Array, x_ref: Array, xd_ref: Array) -> Command:
-        """Command the torque for measured x, reference x_ref and its derivative, each (2n,)."""
+    def update(self, inputs: Inputs) -> Command:
+        """Command the torque of this tick, and learn from it."""
+
+    def dynamics(self, x: Array) -> Array:
+        """The drift acceleration f̂₂(x) (n,) that the present model predicts; zeros without one."""
 
     def state(self) -> dict[str, Array]:
         """Everything that the next update depends on."""

@@ -20,12 +20,12 @@ import numpy as np
 
 from dnnmso_mj import monitors
 from dnnmso_mj.compiling import copy, inner
-from dnnmso_mj.controllers import Command, CompiledTicks, command_of
+from dnnmso_mj.controllers import LEARNING, Command, CompiledTicks, Inputs, command_of
 from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert, solve_spd
 from dnnmso_mj.kernel import Net, forward, output_at
 from dnnmso_mj.learner import KernelLearner, build_learner
 from dnnmso_mj.monitors import Watch
-from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
+from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, correct, start
 from dnnmso_mj.plant import Nominal, NominalModel, bias, inertia
 from dnnmso_mj.scenario import ClassicalMso
 from dnnmso_mj.tick import closed_loop
@@ -102,14 +102,22 @@ class ClassicalMsoController:
     def reset(self, x: Array) -> None:
         start(self._law.observer, x)
 
-    def update(self, x: Array, x_ref: Array, xd_ref: Array) -> Command:
+    def update(self, inputs: Inputs) -> Command:
         if self.ticks is not None:
-            update(self.ticks.parts, x, x_ref, xd_ref)
+            update(self.ticks.parts, inputs)
         else:
-            d_hat = self.learner.predict(x)
-            command_with(self._law, self._command, d_hat, x, x_ref, xd_ref)
-            self.learner.learn(self._law.delta)
+            d_hat = self.learner.predict(inputs.x)
+            command_with(self._law, self._command, d_hat, inputs)
+            if inputs.frozen[0] == LEARNING:
+                self.learner.learn(self._law.delta)
         return self._command
+
+    def dynamics(self, x: Array) -> Array:
+        n, law = x.size // 2, self._law
+        learned, known = np.zeros(n), np.zeros(2 * n)
+        _known(law, x, known)
+        solve_spd(law.nominal.M, self.learner.predict(x).copy(), learned, law.L)
+        return known[n:] + learned
 
     def state(self) -> dict[str, Array]:
         return {"x_hat": self._law.observer.x_hat.copy(), **self.learner.state()}
@@ -120,11 +128,10 @@ class ClassicalMsoController:
 
 
 @inner
-def command_with(
-    law: Law, command: Command, d_hat: Array, x: Array, x_ref: Array, xd_ref: Array
-) -> None:
+def command_with(law: Law, command: Command, d_hat: Array, inputs: Inputs) -> None:
     """Everything of a tick but the network: command with d̂ (n,), leave ∂loss/∂d̂ in `delta`."""
-    n, observer = d_hat.size, law.observer
+    n, observer, x = d_hat.size, law.observer, inputs.x
+    correct(observer, law.inversion, inputs.tau)
     compare(observer, x)
     copy(observer.x_hat, command.x_hat)
     _known(law, x, command.f_hat)
@@ -133,7 +140,7 @@ def command_with(
     solve_spd(law.nominal.M, law.free, law.learned, law.L)
     for i in range(n):
         command.f_hat[n + i] += law.learned[i]
-    invert(law.inversion, x, x_ref, xd_ref, command.f_hat)
+    invert(law.inversion, x, inputs.x_ref, inputs.xd_ref, command.f_hat)
     solve_spd(law.nominal.M, observer.e_obs[n:], law.delta, law.L)  # B₂ is symmetric
     for i in range(n):
         law.delta[i] = -law.delta[i]
@@ -155,14 +162,15 @@ def _known(law: Law, x: Array, out: Array) -> None:
 
 
 @inner
-def update(parts: Parts, x: Array, x_ref: Array, xd_ref: Array) -> None:
+def update(parts: Parts, inputs: Inputs) -> None:
     """One tick of the law above."""
     law, net = parts.law, parts.net
-    command_with(law, parts.command, forward(net, x), x, x_ref, xd_ref)
-    delta = output_at(net)
-    for i in range(law.delta.size):
-        net.deltas[delta + i] = law.delta[i]
-    monitors.learn(net, parts.watch, parts.command.monitors)
+    command_with(law, parts.command, forward(net, inputs.x), inputs)
+    if inputs.frozen[0] == LEARNING:
+        delta = output_at(net)
+        for i in range(law.delta.size):
+            net.deltas[delta + i] = law.delta[i]
+        monitors.learn(net, parts.watch, parts.command.monitors)
 
 
 run_ticks = closed_loop(update)

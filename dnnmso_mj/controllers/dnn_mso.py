@@ -16,12 +16,12 @@ import numpy as np
 
 from dnnmso_mj import monitors
 from dnnmso_mj.compiling import copy, inner
-from dnnmso_mj.controllers import Command, CompiledTicks, command_of
+from dnnmso_mj.controllers import LEARNING, Command, CompiledTicks, Inputs, command_of
 from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert
 from dnnmso_mj.kernel import Net, forward, output_at
 from dnnmso_mj.learner import KernelLearner, build_learner
 from dnnmso_mj.monitors import Watch
-from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
+from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, correct, start
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.scenario import DnnMso
 from dnnmso_mj.tick import closed_loop
@@ -86,23 +86,28 @@ class DnnMsoController:
     def reset(self, x: Array) -> None:
         start(self.observer, x)
 
-    def update(self, x: Array, x_ref: Array, xd_ref: Array) -> Command:
+    def update(self, inputs: Inputs) -> Command:
         if self.ticks is not None:
-            update(self.ticks.parts, x, x_ref, xd_ref)
+            update(self.ticks.parts, inputs)
         else:
-            self._update_with_any_learner(x, x_ref, xd_ref)
+            self._update_with_any_learner(inputs)
         return self.command
 
-    def _update_with_any_learner(self, x: Array, x_ref: Array, xd_ref: Array) -> None:
+    def _update_with_any_learner(self, inputs: Inputs) -> None:
         """What `update` below compiles."""
-        observer, command, known = self.observer, self.command, self._known
+        observer, command, known, x = self.observer, self.command, self._known, inputs.x
+        correct(observer, self.inversion, inputs.tau)
         compare(observer, x)
         copy(observer.x_hat, command.x_hat)
         command.f_hat[:known] = x[known : 2 * known]
         command.f_hat[known:] = self.learner.predict(x)
-        invert(self.inversion, x, x_ref, xd_ref, command.f_hat)
-        self.learner.learn(-observer.e_obs[known:])
+        invert(self.inversion, x, inputs.x_ref, inputs.xd_ref, command.f_hat)
+        if inputs.frozen[0] == LEARNING:
+            self.learner.learn(-observer.e_obs[known:])
         advance(observer, command.f_hat, self.inversion.Bu)
+
+    def dynamics(self, x: Array) -> Array:
+        return self.learner.predict(x)[-x.size // 2 :].copy()
 
     def state(self) -> dict[str, Array]:
         return {"x_hat": self.observer.x_hat.copy(), **self.learner.state()}
@@ -113,9 +118,11 @@ class DnnMsoController:
 
 
 @inner
-def update(parts: Parts, x: Array, x_ref: Array, xd_ref: Array) -> None:
+def update(parts: Parts, inputs: Inputs) -> None:
     """One tick of the law above."""
     observer, command, net, known = parts.observer, parts.command, parts.net, parts.known
+    x = inputs.x
+    correct(observer, parts.inversion, inputs.tau)
     compare(observer, x)
     copy(observer.x_hat, command.x_hat)
     output = forward(net, x)
@@ -123,11 +130,12 @@ def update(parts: Parts, x: Array, x_ref: Array, xd_ref: Array) -> None:
         command.f_hat[i] = x[known + i]
     for i in range(output.size):
         command.f_hat[known + i] = output[i]
-    invert(parts.inversion, x, x_ref, xd_ref, command.f_hat)
-    delta = output_at(net)
-    for i in range(output.size):
-        net.deltas[delta + i] = -observer.e_obs[known + i]
-    monitors.learn(net, parts.watch, command.monitors)
+    invert(parts.inversion, x, inputs.x_ref, inputs.xd_ref, command.f_hat)
+    if inputs.frozen[0] == LEARNING:
+        delta = output_at(net)
+        for i in range(output.size):
+            net.deltas[delta + i] = -observer.e_obs[known + i]
+        monitors.learn(net, parts.watch, command.monitors)
     advance(observer, command.f_hat, parts.inversion.Bu)
 
 

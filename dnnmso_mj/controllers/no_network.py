@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from dnnmso_mj.compiling import copy, inner
-from dnnmso_mj.controllers import Command, CompiledTicks, command_of
+from dnnmso_mj.controllers import Command, CompiledTicks, Inputs, command_of
 from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert
 from dnnmso_mj.monitors import Monitors
-from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
+from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, correct, start
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.scenario import NoNetwork
 from dnnmso_mj.tick import closed_loop
@@ -58,9 +58,12 @@ class NoNetworkController:
     def reset(self, x: Array) -> None:
         start(self._parts.observer, x)
 
-    def update(self, x: Array, x_ref: Array, xd_ref: Array) -> Command:
-        update(self._parts, x, x_ref, xd_ref)
+    def update(self, inputs: Inputs) -> Command:
+        update(self._parts, inputs)
         return self._parts.command
+
+    def dynamics(self, x: Array) -> Array:
+        return np.zeros(x.size // 2)
 
     def state(self) -> dict[str, Array]:
         return {"x_hat": self._parts.observer.x_hat.copy()}
@@ -70,14 +73,15 @@ class NoNetworkController:
 
 
 @inner
-def update(parts: Parts, x: Array, x_ref: Array, xd_ref: Array) -> None:
+def update(parts: Parts, inputs: Inputs) -> None:
     """One tick of the law above."""
-    observer, command = parts.observer, parts.command
+    observer, command, x = parts.observer, parts.command, inputs.x
+    correct(observer, parts.inversion, inputs.tau)
     compare(observer, x)
     copy(observer.x_hat, command.x_hat)
     for i in range(parts.known):
         command.f_hat[i] = x[parts.known + i]
-    invert(parts.inversion, x, x_ref, xd_ref, command.f_hat)
+    invert(parts.inversion, x, inputs.x_ref, inputs.xd_ref, command.f_hat)
     advance(observer, command.f_hat, parts.inversion.Bu)
 
 

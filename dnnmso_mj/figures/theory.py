@@ -25,7 +25,8 @@ from dnnmso_mj.figures.drawing import (
     subscript,
 )
 from dnnmso_mj.metrics import worst_error
-from dnnmso_mj.scenario import Madam, NoNetwork
+from dnnmso_mj.scenario import ClassicalMso, DnnMso, Madam
+from dnnmso_mj.scenario.controller import inversion as inversion_of
 from dnnmso_mj.trace import Array, Trace
 
 Panel = Callable[[Axes, Trace], None]
@@ -88,7 +89,7 @@ def _update_ratios(ax: Axes, trace: Trace) -> None:
 def _theorem_1(ax: Axes, trace: Trace) -> None:
     _layers(ax, trace["t"], trace["eta_bound"], log_line)
     controller = trace.scenario.controller
-    if not isinstance(controller, NoNetwork) and isinstance(controller.rule, Madam):
+    if isinstance(controller, DnnMso | ClassicalMso) and isinstance(controller.rule, Madam):
         ax.axhline(controller.madam.eta, color=INK, label="η used", **DASHED)
     _name(ax, trace, "Theorem 1", "bound on η (–)")
 
@@ -167,7 +168,9 @@ def _static_bound(trace: Trace) -> float | None:
 
     It has none where K is not scalar, where B_s is general, and while the actuators saturate.
     """
-    inversion, half = trace.scenario.controller.inversion, len(trace) // 2
+    inversion, half = inversion_of(trace.scenario.controller), len(trace) // 2
+    if inversion is None:
+        return None
     K, lam = inversion.K, inversion.lam
     if inversion.slack_matrix is not None or len(set(K)) > 1 or lam == 0.0:
         return None

@@ -8,6 +8,7 @@ import numpy as np
 
 from dnnmso_mj.dynamics import centre_and_inertia
 from dnnmso_mj.scenario import Inertia, NoNetwork, Plant, Scenario, expand
+from dnnmso_mj.scenario.controller import inversion as inversion_of
 from dnnmso_mj.wording import KeyPath
 
 UNSTABLE = "makes the loop, sampled each dt, unstable even with an exact model"
@@ -59,8 +60,11 @@ def _gains(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     (K₁, K₂: gains of angles and velocities). Its torque held over a step, the loop is stable only
     while k_d dt < 2 and k_p dt < 2 k_d (Jury's conditions).
     """
-    inversion, controller = scenario.controller.inversion, scenario.controller
-    if inversion.slack_matrix is not None or not isinstance(inversion.effectiveness, Inertia):
+    controller = scenario.controller
+    inversion = inversion_of(controller)
+    if inversion is None or inversion.slack_matrix is not None:
+        return
+    if not isinstance(inversion.effectiveness, Inertia):
         return
     n, dt = scenario.n_joints, scenario.dt
     K = expand(inversion.K, 2 * n)

@@ -24,6 +24,7 @@ from dnnmso_mj.scenario.controller import (
     NoNetwork,
     Observer,
 )
+from dnnmso_mj.scenario.events import Event, Freeze
 from dnnmso_mj.scenario.fields import (
     FiniteEach,
     NonNegative,
@@ -47,6 +48,8 @@ __all__ = [
     "Controller",
     "DnnMso",
     "Effectiveness",
+    "Event",
+    "Freeze",
     "Imperfections",
     "Inertia",
     "Initial",
@@ -221,6 +224,8 @@ class Scenario(Strict):
     """What drives the robot."""
     imperfections: Imperfections = Imperfections()
     """Limits of the robot's parts; none unless given."""
+    events: Annotated[tuple[Event, ...], BeforeValidator(as_tuple)] = ()
+    """What happens at set times."""
     real_time: RealTime = RealTime()
     """What happens when the wall clock is not kept."""
 

@@ -65,6 +65,8 @@ class Observer(Strict):
     """Observer gain (1/s): one number, or one for each of the 2n states."""
     feedback: Literal["stable", "as_printed"] = "stable"
     """stable: +K₂(X - X̂). as_printed: the paper's sign, which diverges."""
+    torque: Literal["commanded", "applied"] = "commanded"
+    """The torque that it takes for u: its own command (paper), or what the drives say acted."""
 
 
 class Inertia(Strict):
@@ -191,3 +193,22 @@ class ClassicalMso(Strict):
 
 
 Controller = Annotated[DnnMso | NoNetwork | ClassicalMso, Field(discriminator="kind")]
+
+
+def inversion(controller: Controller) -> Inversion | None:
+    """The dynamic inversion of a controller, if that is its law."""
+    part: Inversion | None = getattr(controller, "inversion", None)
+    return part
+
+
+def effectiveness(controller: Controller) -> Effectiveness:
+    """What a controller takes for B₂; of one that does not say, the plant's own M(q)⁻¹."""
+    part: Effectiveness = getattr(
+        inversion(controller) or controller, "effectiveness", Inertia(kind="inertia")
+    )
+    return part
+
+
+def lookahead(controller: Controller) -> float:
+    """How far ahead of its tick (s) a controller reads the reference: the delay it knows of."""
+    return float(getattr(controller, "lookahead", 0.0))
