@@ -10,7 +10,7 @@ import numpy as np
 from dnnmso_mj.inversion import DynamicInversion
 from dnnmso_mj.monitors import Monitors
 from dnnmso_mj.plant import Mjcf, NominalModel
-from dnnmso_mj.scenario import ClassicalMso, DnnMso, NoNetwork, Scenario
+from dnnmso_mj.scenario import ClassicalMso, DnnMso, LewisNn, NoNetwork, RbfMso, Scenario
 
 if TYPE_CHECKING:
     from dnnmso_mj.tick import Loop
@@ -119,7 +119,9 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
     """
     from dnnmso_mj.controllers.classical_mso import ClassicalMsoController
     from dnnmso_mj.controllers.dnn_mso import DnnMsoController
+    from dnnmso_mj.controllers.lewis_nn import LewisNnController
     from dnnmso_mj.controllers.no_network import NoNetworkController
+    from dnnmso_mj.controllers.rbf_mso import RbfMsoController
 
     nominal = NominalModel(scenario, mjcf)
     spec, n, dt = scenario.controller, scenario.n_joints, scenario.dt
@@ -130,3 +132,7 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
             return NoNetworkController(spec, n, dt, nominal)
         case ClassicalMso():
             return ClassicalMsoController(spec, n, dt, scenario.seed, nominal, watch=watch)
+        case RbfMso():
+            return RbfMsoController(spec, n, dt, scenario.seed, nominal)
+        case LewisNn():
+            return LewisNnController(spec, n, dt, scenario.seed, nominal)

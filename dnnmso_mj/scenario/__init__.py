@@ -23,6 +23,7 @@ from dnnmso_mj.scenario.controller import (
     Network,
     NoNetwork,
     Observer,
+    RbfMso,
 )
 from dnnmso_mj.scenario.events import Event, Freeze
 from dnnmso_mj.scenario.fields import (
@@ -37,6 +38,7 @@ from dnnmso_mj.scenario.fields import (
     expand,
     refusal,
 )
+from dnnmso_mj.scenario.neural import LewisNn
 from dnnmso_mj.scenario.optimizers import Adam, ByMadam, Madam, Rule, Sgd, SignSgd
 
 __all__ = [
@@ -54,11 +56,13 @@ __all__ = [
     "Inertia",
     "Initial",
     "Inversion",
+    "LewisNn",
     "Madam",
     "Network",
     "NoNetwork",
     "Observer",
     "Plant",
+    "RbfMso",
     "RealTime",
     "Reference",
     "Rule",

@@ -18,6 +18,7 @@ from dnnmso_mj.scenario.fields import (
     as_tuple,
     refusal,
 )
+from dnnmso_mj.scenario.neural import LewisNn
 from dnnmso_mj.scenario.optimizers import ByMadam, Madam, Optimizer, Rule, check_resolvable, chosen
 
 MAX_WEIGHTS = 10_000_000
@@ -177,9 +178,7 @@ class ClassicalMso(Strict):
 
     @model_validator(mode="after")
     def _needs_a_model(self) -> ClassicalMso:
-        if isinstance(self.inversion.effectiveness, Constant):
-            problem = "leaves classical_mso without a model of the plant; allowed: inertia"
-            raise refusal(("inversion.effectiveness.kind", problem))
+        _refuse_no_model(self.kind, self.inversion)
         if self.network.outputs != "full":
             problem = "has no meaning for classical_mso, which learns a torque; allowed: full"
             raise refusal(("network.outputs", problem))
@@ -192,7 +191,42 @@ class ClassicalMso(Strict):
         return chosen(self.optimizer, self.madam)
 
 
-Controller = Annotated[DnnMso | NoNetwork | ClassicalMso, Field(discriminator="kind")]
+class RbfMso(Strict):
+    """Eq. 4 with radial basis functions for d̂, tuned by a gradient law."""
+
+    kind: Literal["rbf_mso"]
+    """The modified state observer with known dynamics and Gaussian features."""
+    inversion: Inversion = Inversion()
+    """From the desired dynamics to a torque."""
+    observer: Observer = Observer()
+    """What the weights are tuned against."""
+    centres: Annotated[int, Field(ge=1, le=100_000)] = 100
+    """Number of Gaussians, their centres drawn over the box."""
+    box: PositiveEach = (1.5,)
+    """Half-width of the box of states about zero (rad, rad/s): one number, or one for each."""
+    width: Positive = 0.5
+    """Standard deviation of each Gaussian, in half-widths of the box."""
+    Gamma: Positive = 1000.0
+    """Adaptation gain Γ."""
+    kappa: NonNegative = 0.1
+    """κ of the e-modification, which keeps the weights bounded."""
+
+    @model_validator(mode="after")
+    def _needs_a_model(self) -> RbfMso:
+        _refuse_no_model(self.kind, self.inversion)
+        return self
+
+
+def _refuse_no_model(kind: str, inversion: Inversion) -> None:
+    if isinstance(inversion.effectiveness, Constant):
+        problem = f"leaves {kind} without a model of the plant; allowed: inertia"
+        raise refusal(("inversion.effectiveness.kind", problem))
+
+
+Controller = Annotated[
+    DnnMso | NoNetwork | ClassicalMso | RbfMso | LewisNn,
+    Field(discriminator="kind"),
+]
 
 
 def inversion(controller: Controller) -> Inversion | None:
