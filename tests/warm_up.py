@@ -22,6 +22,8 @@ def main() -> None:
         ("paper_no_network", []),
         ("classical_mso", []),
         ("classical_mso", [double]),
+        ("paper", ["controller.kind=rbf_mso"]),
+        ("paper", ["controller.kind=lewis_nn"]),
     ):
         scenario = load_scenario(name, [*sets, "duration=0.01"])
         simulate(scenario)

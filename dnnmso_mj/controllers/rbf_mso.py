@@ -89,11 +89,13 @@ class RbfMsoController:
         return drift(self._parts.law, x, self._parts.rbf.d_hat)
 
     def state(self) -> dict[str, Array]:
-        return {"x_hat": self._parts.law.observer.x_hat.copy(), "W": self._parts.rbf.W.copy()}
+        x_hat, rbf = self._parts.law.observer.x_hat, self._parts.rbf
+        return {"x_hat": x_hat.copy(), "W": rbf.W.copy(), "centres": rbf.centres.copy()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
         start(self._parts.law.observer, state["x_hat"])
         self._parts.rbf.W[:] = state["W"]
+        self._parts.rbf.centres[:] = state["centres"]
 
 
 def build_rbf(spec: RbfMso, n_joints: int, dt: float, seed: int) -> Rbf:

@@ -204,11 +204,11 @@ class RbfMso(Strict):
     """Number of Gaussians, their centres drawn over the box."""
     box: PositiveEach = (1.5,)
     """Half-width of the box of states about zero (rad, rad/s): one number, or one for each."""
-    width: Positive = 0.5
+    width: Positive = 0.7
     """Standard deviation of each Gaussian, in half-widths of the box."""
-    Gamma: Positive = 1000.0
+    Gamma: Positive = 300.0
     """Adaptation gain Γ."""
-    kappa: NonNegative = 0.1
+    kappa: NonNegative = 0.001
     """κ of the e-modification, which keeps the weights bounded."""
 
     @model_validator(mode="after")

@@ -20,11 +20,11 @@ class LewisNn(Strict):
     """λ of the filtered error r = ė + λ e (1/s)."""
     K_v: PositiveEach = (20.0,)
     """Feedback on r (N·m·s/rad): one number, or one for each joint."""
-    F: Positive = 10.0
+    F: Positive = 100.0
     """Learning rate of the output weights."""
     G: Positive = 10.0
     """Learning rate of the hidden weights."""
-    kappa: NonNegative = 0.1
+    kappa: NonNegative = 0.01
     """κ, the forgetting in proportion to the error that keeps the weights bounded."""
     K_Z: NonNegative = 0.05
     """Gain of the robustifying term (N·m·s/rad)."""
