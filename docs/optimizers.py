@@ -40,8 +40,8 @@ Measures = dict[str, float]
 # The learning rates that a rule may choose from; Madam's η* stays the paper's 100 η, at most 1.
 GRIDS: dict[str, tuple[float, ...]] = {
     "madam": (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2),
-    "sgd": (1e-2, 3e-2, 1e-1, 3e-1, 1.0, 3.0),
-    "adam": (3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2),
+    "sgd": (1e-3, 3e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0, 3.0),
+    "adam": (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2),
     "sign_sgd": (3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2),
 }
 ACTIVATIONS = ("sigmoid", "tanh", "relu")
@@ -161,12 +161,17 @@ def tune(cases: list[Case], seeds: int, jobs: int) -> list[Case]:
         for seed in tuning
     ]
     found = run_all(tasks, jobs, "tuning")
+    return [best(options, tuning, found) for options in tried.values()]
+
+
+def best(options: list[Case], seeds: Iterable[int], found: dict[Task, Measures]) -> Case:
+    """The option with the least median `rmse_steady`."""
 
     def median(option: Case) -> float:
-        errors = [found[Task(option, seed, watched=False)]["rmse_steady"] for seed in tuning]
+        errors = [found[Task(option, seed, watched=False)]["rmse_steady"] for seed in seeds]
         return float(np.median(errors))
 
-    return [min(options, key=median) for options in tried.values()]
+    return min(options, key=median)
 
 
 def table(cases: list[Case], seeds: int, found: dict[Task, Measures]) -> str:

@@ -8,8 +8,8 @@
 The network stands for M(q)(q̈_ref + λ ė) + V(q, q̇_ref + λ e) + G(q). σ is the sigmoid with a
 constant 1 beside it, for thresholds of the output, and ‖Ẑ‖ the Frobenius norm of all weights. The
 correction of backpropagation, σ̂' V̂ᵀ y, and the forgetting in proportion to ‖r‖ bound r and the
-weights without excitation (Theorem 3.1 there, for weights in continuous time; here they take an
-Euler step a tick).
+weights without excitation (proved there for weights in continuous time; here they take an Euler
+step a tick).
 
 N.B. Ŵ starts at zero, as published, and V̂ at random: at zero the hidden units would stay alike.
 
