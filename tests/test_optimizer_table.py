@@ -77,9 +77,9 @@ def test_each_case_takes_the_rate_with_the_least_median_error():
 def test_a_row_counts_diverged_runs_as_infinitely_bad_and_marks_a_rate_at_the_end_of_its_grid():
     fine = dict.fromkeys(optimizers.COLUMNS, 1.0) | {"diverged": 0.0, "rmse_steady": 1e-3}
     lost = {"diverged": 1.0, "rmse_steady": math.inf}
-    cells = list(optimizers.row(case_of("madam", 3e-2), [fine, lost, lost]))
+    cells = list(optimizers.row(case_of("madam", 3e-2), [fine, *[lost] * 4]))
     assert cells[:4] == ["2", "madam", "0.03*", "inf [inf, inf]"]
-    assert cells[-1] == "2 of 3"
+    assert cells[-1] == "4 of 5"
     assert list(optimizers.row(case_of("madam", 1e-3), [fine] * 3))[2:4] == [
         "0.001",
         "0.001 [0.001, 0.001]",
