@@ -10,7 +10,15 @@ import numpy as np
 from dnnmso_mj.inversion import DynamicInversion
 from dnnmso_mj.monitors import Monitors
 from dnnmso_mj.plant import Mjcf, NominalModel
-from dnnmso_mj.scenario import ClassicalMso, DnnMso, LewisNn, NoNetwork, RbfMso, Scenario
+from dnnmso_mj.scenario import (
+    ClassicalMso,
+    DnnMso,
+    DnnMsoReplay,
+    LewisNn,
+    NoNetwork,
+    RbfMso,
+    Scenario,
+)
 
 if TYPE_CHECKING:
     from dnnmso_mj.tick import Loop
@@ -119,6 +127,7 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
     """
     from dnnmso_mj.controllers.classical_mso import ClassicalMsoController
     from dnnmso_mj.controllers.dnn_mso import DnnMsoController
+    from dnnmso_mj.controllers.dnn_mso_replay import DnnMsoReplayController
     from dnnmso_mj.controllers.lewis_nn import LewisNnController
     from dnnmso_mj.controllers.no_network import NoNetworkController
     from dnnmso_mj.controllers.rbf_mso import RbfMsoController
@@ -128,6 +137,8 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
     match spec:
         case DnnMso():
             return DnnMsoController(spec, n, dt, scenario.seed, nominal, watch=watch)
+        case DnnMsoReplay():
+            return DnnMsoReplayController(spec, n, dt, scenario.seed, nominal, watch=watch)
         case NoNetwork():
             return NoNetworkController(spec, n, dt, nominal)
         case ClassicalMso():

@@ -17,20 +17,21 @@ from dnnmso_mj.scenario.controller import (
     Constant,
     Controller,
     DnnMso,
+    DnnMsoReplay,
     Effectiveness,
     Inertia,
     Inversion,
+    KnownDelay,
     Network,
     NoNetwork,
     Observer,
     RbfMso,
 )
-from dnnmso_mj.scenario.events import Event, Freeze
+from dnnmso_mj.scenario.events import Event, Freeze, Payload, Push
 from dnnmso_mj.scenario.fields import (
     FiniteEach,
     NonNegative,
     Positive,
-    PositiveEach,
     Positives,
     Strict,
     Vector,
@@ -38,6 +39,7 @@ from dnnmso_mj.scenario.fields import (
     expand,
     refusal,
 )
+from dnnmso_mj.scenario.imperfections import Friction, Imperfections
 from dnnmso_mj.scenario.neural import LewisNn
 from dnnmso_mj.scenario.optimizers import Adam, ByMadam, Madam, Rule, Sgd, SignSgd
 
@@ -49,19 +51,24 @@ __all__ = [
     "Constant",
     "Controller",
     "DnnMso",
+    "DnnMsoReplay",
     "Effectiveness",
     "Event",
     "Freeze",
+    "Friction",
     "Imperfections",
     "Inertia",
     "Initial",
     "Inversion",
+    "KnownDelay",
     "LewisNn",
     "Madam",
     "Network",
     "NoNetwork",
     "Observer",
+    "Payload",
     "Plant",
+    "Push",
     "RbfMso",
     "RealTime",
     "Reference",
@@ -178,13 +185,6 @@ class Waypoints(Strict):
 Reference = Annotated[Sinusoid | Setpoint | Waypoints, Field(discriminator="kind")]
 
 
-class Imperfections(Strict):
-    """What separates the simulation from a robot."""
-
-    torque_limit: PositiveEach | None = None
-    """Largest |torque| of each joint's actuator (N·m); null: none."""
-
-
 class Stall(Strict):
     """A hang of the controller, to see what follows from it."""
 
@@ -217,7 +217,7 @@ class Scenario(Strict):
     dt: Annotated[float, Field(ge=1e-5, le=0.1, allow_inf_nan=False)] = 0.001
     """Control period and integration step (s)."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Seed of the initial weights."""
+    """Seed of the initial weights, and of all noise."""
     plant: Plant = Plant()
     """The robot."""
     initial: Initial = Initial()
@@ -227,7 +227,7 @@ class Scenario(Strict):
     controller: Controller
     """What drives the robot."""
     imperfections: Imperfections = Imperfections()
-    """Limits of the robot's parts; none unless given."""
+    """What separates it from a robot; nothing unless given."""
     events: Annotated[tuple[Event, ...], BeforeValidator(as_tuple)] = ()
     """What happens at set times."""
     real_time: RealTime = RealTime()
