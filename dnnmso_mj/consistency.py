@@ -146,6 +146,9 @@ def _controller_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, 
         yield "controller.observer.K2", len(controller.observer.K2), {1, 2 * n}
     if isinstance(controller, Rival | Backstepping):  # each of their gains is of a joint
         yield from _numbers("controller", controller, n)
+    for name, allowed in (("K_v", {1, n}), ("box", {1, 2 * n})):
+        if hasattr(controller, name):
+            yield f"controller.{name}", len(getattr(controller, name)), allowed
 
 
 def _reference_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:

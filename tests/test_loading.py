@@ -139,7 +139,7 @@ REFUSED = {
     "unknown key of a kind": (
         "  madm: {}\n",
         "6: controller.madm = {}: unknown key; allowed: kind, inversion, observer, network, "
-        "madam; did you mean 'madam'?",
+        "madam, optimizer; did you mean 'madam'?",
     ),
     "unknown choice": (
         "plant: {integrator: RK5}\n",

@@ -16,7 +16,9 @@ from dnnmso_mj.scenario import (
     ConcurrentLearning,
     DnnMso,
     DnnMsoReplay,
+    LewisNn,
     NoNetwork,
+    RbfMso,
     Scenario,
     SlotineLi,
 )
@@ -132,24 +134,26 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
     from dnnmso_mj.controllers.concurrent_learning import ConcurrentLearningController
     from dnnmso_mj.controllers.dnn_mso import DnnMsoController
     from dnnmso_mj.controllers.dnn_mso_replay import DnnMsoReplayController
+    from dnnmso_mj.controllers.lewis_nn import LewisNnController
     from dnnmso_mj.controllers.no_network import NoNetworkController
+    from dnnmso_mj.controllers.rbf_mso import RbfMsoController
     from dnnmso_mj.controllers.rivals import build_rival
     from dnnmso_mj.controllers.slotine_li import SlotineLiController
 
     nominal = NominalModel(scenario, mjcf)
-    spec, n, dt = scenario.controller, scenario.n_joints, scenario.dt
+    n, dt, seed = scenario.n_joints, scenario.dt, scenario.seed
+    spec: Any = scenario.controller
     if isinstance(spec, Rival):
         return build_rival(spec, n, dt, nominal)
-    if isinstance(spec, NoNetwork):
-        return NoNetworkController(spec, n, dt, nominal)
-    if isinstance(spec, SlotineLi):
-        return SlotineLiController(spec, dt, nominal)
-    if isinstance(spec, ConcurrentLearning):
-        return ConcurrentLearningController(spec, dt, nominal)
-    with_network: dict[type, Callable[..., Controller]] = {
-        DnnMso: DnnMsoController,
-        DnnMsoReplay: DnnMsoReplayController,
-        ClassicalMso: ClassicalMsoController,
-        Backstepping: BacksteppingController,
+    builders: dict[type, Callable[[], Controller]] = {
+        DnnMso: lambda: DnnMsoController(spec, n, dt, seed, nominal, watch=watch),
+        DnnMsoReplay: lambda: DnnMsoReplayController(spec, n, dt, seed, nominal, watch=watch),
+        Backstepping: lambda: BacksteppingController(spec, n, dt, seed, nominal, watch=watch),
+        ClassicalMso: lambda: ClassicalMsoController(spec, n, dt, seed, nominal, watch=watch),
+        RbfMso: lambda: RbfMsoController(spec, n, dt, seed, nominal),
+        LewisNn: lambda: LewisNnController(spec, n, dt, seed, nominal),
+        SlotineLi: lambda: SlotineLiController(spec, dt, nominal),
+        ConcurrentLearning: lambda: ConcurrentLearningController(spec, dt, nominal),
+        NoNetwork: lambda: NoNetworkController(spec, n, dt, nominal),
     }
-    return with_network[type(spec)](spec, n, dt, scenario.seed, nominal, watch=watch)
+    return builders[type(spec)]()

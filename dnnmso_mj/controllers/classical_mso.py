@@ -8,7 +8,8 @@ f and B come from the nominal model, which a scenario may set wrong; d̂ (n,) N�
 
 N.B. the paper prints Eq. 4 with an unbalanced parenthesis, which leaves it open whether B
 multiplies K₂, and with the unstable sign; K₂ stands alone here, as in the DNN-MSO. The works it
-cites train d̂ by gradient laws of their own; here Madam trains it, so that only the model differs.
+cites train d̂ by gradient laws of their own, as `rbf_mso` does; here Madam trains it, so that only
+the model differs.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from dnnmso_mj.monitors import Watch
 from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, correct, start
 from dnnmso_mj.plant import Nominal, NominalModel, bias, inertia
 from dnnmso_mj.scenario import ClassicalMso
+from dnnmso_mj.scenario import Inversion as InversionSpec
+from dnnmso_mj.scenario import Observer as ObserverSpec
 from dnnmso_mj.tick import closed_loop
 
 Array = np.ndarray
@@ -81,19 +84,9 @@ class ClassicalMsoController:
         self.learner = build_learner(spec.network, spec.rule, 2 * n, n, seed, watch=watch)
         self.n_layers = self.learner.shape.n_layers
         self._nominal = nominal  # keeps alive what compiled code knows by address
-        inversion = build_inversion(spec.inversion, n, nominal.view)
-        observer = build_observer(spec.observer, 2 * n, dt)
-        self._command = command_of(inversion, observer.e_obs, self.learner.monitors)
-        self._law = Law(
-            nominal=nominal.view,
-            inversion=inversion,
-            observer=observer,
-            f_obs=np.zeros(2 * n),
-            learned=np.zeros(n),
-            delta=np.zeros(n),
-            free=np.zeros(n),
-            L=np.zeros((n, n)),
-        )
+        self._law = law = build_law(spec.inversion, spec.observer, n, dt, nominal)
+        e_obs, watched = law.observer.e_obs, self.learner.monitors
+        self._command = command_of(law.inversion, e_obs, watched)
         self.ticks = None
         if isinstance(self.learner, KernelLearner):
             parts = Parts(self._law, self._command, self.learner.net, self.learner.watch)
@@ -113,11 +106,7 @@ class ClassicalMsoController:
         return self._command
 
     def dynamics(self, x: Array) -> Array:
-        n, law = x.size // 2, self._law
-        learned, known = np.zeros(n), np.zeros(2 * n)
-        _known(law, x, known)
-        solve_spd(law.nominal.M, self.learner.predict(x).copy(), learned, law.L)
-        return known[n:] + learned
+        return drift(self._law, x, self.learner.predict(x).astype(float))
 
     def state(self) -> dict[str, Array]:
         return {"x_hat": self._law.observer.x_hat.copy(), **self.learner.state()}
@@ -125,6 +114,31 @@ class ClassicalMsoController:
     def restore(self, state: Mapping[str, Array]) -> None:
         start(self._law.observer, state["x_hat"])
         self.learner.restore(state)
+
+
+def build_law(
+    inversion: InversionSpec, observer: ObserverSpec, n: int, dt: float, nominal: NominalModel
+) -> Law:
+    """The law for n joints, with the controller's own model, at control period dt (s)."""
+    return Law(
+        nominal=nominal.view,
+        inversion=build_inversion(inversion, n, nominal.view),
+        observer=build_observer(observer, 2 * n, dt),
+        f_obs=np.zeros(2 * n),
+        learned=np.zeros(n),
+        delta=np.zeros(n),
+        free=np.zeros(n),
+        L=np.zeros((n, n)),
+    )
+
+
+def drift(law: Law, x: Array, d_hat: Array) -> Array:
+    """−M⁻¹(V + G) + B₂ d̂ (n,): the accelerations without torque at x (2n,), for d̂ (n,) there."""
+    n = d_hat.size
+    learned, known = np.zeros(n), np.zeros(2 * n)
+    _known(law, x, known)
+    solve_spd(law.nominal.M, d_hat, learned, law.L)
+    return known[n:] + learned
 
 
 @inner

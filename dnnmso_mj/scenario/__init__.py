@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from dnnmso_mj.consistency import contradictions, entries
 from dnnmso_mj.scenario.adaptive import ConcurrentLearning, SlotineLi
 from dnnmso_mj.scenario.backstepping import Backstepping
-from dnnmso_mj.scenario.controller import ClassicalMso, Controller, DnnMso, NoNetwork
+from dnnmso_mj.scenario.controller import ClassicalMso, Controller, DnnMso, NoNetwork, RbfMso
 from dnnmso_mj.scenario.effectiveness import Constant, Effectiveness, Inertia
 from dnnmso_mj.scenario.events import Event, Freeze, Payload, Push
 from dnnmso_mj.scenario.fields import (
@@ -31,6 +31,7 @@ from dnnmso_mj.scenario.fields import (
 from dnnmso_mj.scenario.imperfections import Friction, Imperfections
 from dnnmso_mj.scenario.inversion import Inversion
 from dnnmso_mj.scenario.learning import Network, Observer
+from dnnmso_mj.scenario.neural import LewisNn
 from dnnmso_mj.scenario.optimizers import Adam, ByMadam, Madam, Rule, Sgd, SignSgd
 from dnnmso_mj.scenario.replay import DnnMsoReplay, KnownDelay
 from dnnmso_mj.scenario.rivals import L1, Adrc, ComputedTorque, Pd, Pid, Rise, SlidingMode
@@ -59,6 +60,7 @@ __all__ = [
     "Initial",
     "Inversion",
     "KnownDelay",
+    "LewisNn",
     "Madam",
     "Network",
     "NoNetwork",
@@ -68,6 +70,7 @@ __all__ = [
     "Pid",
     "Plant",
     "Push",
+    "RbfMso",
     "RealTime",
     "Reference",
     "Rise",

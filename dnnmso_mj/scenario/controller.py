@@ -9,9 +9,10 @@ from pydantic import Field, model_validator
 from dnnmso_mj.scenario.adaptive import ConcurrentLearning, SlotineLi
 from dnnmso_mj.scenario.backstepping import Backstepping
 from dnnmso_mj.scenario.effectiveness import Constant, Effectiveness, Inertia
-from dnnmso_mj.scenario.fields import Strict, refusal
+from dnnmso_mj.scenario.fields import NonNegative, Positive, PositiveEach, Strict, refusal
 from dnnmso_mj.scenario.inversion import Inversion
 from dnnmso_mj.scenario.learning import Network, Observer
+from dnnmso_mj.scenario.neural import LewisNn
 from dnnmso_mj.scenario.optimizers import ByMadam, Madam, Optimizer, Rule, check_resolvable, chosen
 from dnnmso_mj.scenario.replay import DnnMsoReplay
 from dnnmso_mj.scenario.rivals import Rival
@@ -75,9 +76,7 @@ class ClassicalMso(Strict):
 
     @model_validator(mode="after")
     def _needs_a_model(self) -> ClassicalMso:
-        if isinstance(self.inversion.effectiveness, Constant):
-            problem = "leaves classical_mso without a model of the plant; allowed: inertia"
-            raise refusal(("inversion.effectiveness.kind", problem))
+        _refuse_no_model(self.kind, self.inversion)
         if self.network.outputs != "full":
             problem = "has no meaning for classical_mso, which learns a torque; allowed: full"
             raise refusal(("network.outputs", problem))
@@ -90,10 +89,44 @@ class ClassicalMso(Strict):
         return chosen(self.optimizer, self.madam)
 
 
+class RbfMso(Strict):
+    """Eq. 4 with radial basis functions for d̂, tuned by a gradient law."""
+
+    kind: Literal["rbf_mso"]
+    """The modified state observer with known dynamics and Gaussian features."""
+    inversion: Inversion = Inversion()
+    """From the desired dynamics to a torque."""
+    observer: Observer = Observer()
+    """What the weights are tuned against."""
+    centres: Annotated[int, Field(ge=1, le=100_000)] = 100
+    """Number of Gaussians, their centres drawn over the box."""
+    box: PositiveEach = (1.5,)
+    """Half-width of the box of states about zero (rad, rad/s): one number, or one for each."""
+    width: Positive = 0.7
+    """Standard deviation of each Gaussian, in half-widths of the box."""
+    Gamma: Positive = 300.0
+    """Adaptation gain Γ."""
+    kappa: NonNegative = 0.001
+    """κ of the e-modification, which keeps the weights bounded."""
+
+    @model_validator(mode="after")
+    def _needs_a_model(self) -> RbfMso:
+        _refuse_no_model(self.kind, self.inversion)
+        return self
+
+
+def _refuse_no_model(kind: str, inversion: Inversion) -> None:
+    if isinstance(inversion.effectiveness, Constant):
+        problem = f"leaves {kind} without a model of the plant; allowed: inertia"
+        raise refusal(("inversion.effectiveness.kind", problem))
+
+
 Controller = Annotated[
     DnnMso
     | NoNetwork
     | ClassicalMso
+    | RbfMso
+    | LewisNn
     | DnnMsoReplay
     | Backstepping
     | SlotineLi

@@ -47,7 +47,7 @@ class Sgd(Strict):
 
     kind: Literal["sgd"]
     """W ← W - η m, m ← momentum m + g."""
-    eta: Rate = 0.01
+    eta: Rate = 0.1
     """Learning rate η."""
     momentum: Forgetting = 0.0
     """Forgetting factor of the sum of gradients; 0 is plain gradient descent."""
