@@ -16,7 +16,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from dnnmso_mj import __version__
-from dnnmso_mj.cli import bench, check, logs, run, scenarios, sweep
+from dnnmso_mj.cli import audit, bench, check, logs, run, scenarios, sweep
 from dnnmso_mj.cli.shared import BAD_INPUT, INTERRUPTED
 from dnnmso_mj.errors import DnnmsoError
 
@@ -135,6 +135,7 @@ def _root(
 # In the order of the help.
 app.command()(run.run)
 app.command()(sweep.sweep)
+app.command()(audit.audit)
 app.command()(check.check)
 app.command()(logs.plot)
 app.command()(logs.replay)
