@@ -28,9 +28,11 @@ def knowledge(f_true: Array, f_hat: Array) -> float | None:
         bad = values[~np.isfinite(values)]
         if bad.size:
             raise NonFiniteError(name, float(bad[0]))
-    # Scaled by the largest value of either, so that no square leaves the range of floating point.
-    largest = max(float(np.abs(f_true).max()), float(np.abs(f_hat).max()))
-    if not f_true.any():
-        return None
-    truth, error = f_true / largest, (f_true - f_hat) / largest
-    return 1.0 - float(np.sqrt(np.mean(error**2) / np.mean(truth**2)))
+    truth = _root_mean_square(f_true)
+    return 1.0 - _root_mean_square(f_true - f_hat) / truth if truth else None
+
+
+def _root_mean_square(values: Array) -> float:
+    """Scaled by the largest, so that no square leaves the range of floating point."""
+    largest = float(np.abs(values).max())
+    return largest * float(np.sqrt(np.mean((values / largest) ** 2))) if largest else 0.0

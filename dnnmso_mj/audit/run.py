@@ -79,10 +79,11 @@ def run_audit(
             found[row["point"], row["seed"]] = row
             if progress is not None:
                 progress(1)
-    return _gather(plan, [found[key] for key in sorted(found)], started)
+    return gather(plan, [found[key] for key in sorted(found)], time.perf_counter() - started)
 
 
-def _gather(plan: AuditPlan, done: Sequence[Row], started: float) -> Audit:
+def gather(plan: AuditPlan, done: Sequence[Row], wall_s: float) -> Audit:
+    """The audit that finished examinations make, given by controller, then seed."""
     names = [subject.name for subject in plan.subjects]
     findings: list[Findings] = [row["findings"] for row in done if row["status"] == "ok"]
     rows = tuple(row for found in findings for row in found.rows)
@@ -96,7 +97,7 @@ def _gather(plan: AuditPlan, done: Sequence[Row], started: float) -> Audit:
             for row in done
             if row["status"] != "ok"
         ),
-        wall_s=time.perf_counter() - started,
+        wall_s=wall_s,
     )
 
 
