@@ -24,7 +24,7 @@ from dnnmso_mj.audit.region import distance_to_hull, region_of
 from dnnmso_mj.audit.run import Examination, gather
 from dnnmso_mj.audit.subject import Questions, Subject, examine
 from dnnmso_mj.audit.summary import MEASURES, summarise
-from dnnmso_mj.audit.unseen import SPAN, reference_states, unseen_trajectories
+from dnnmso_mj.audit.unseen import SETTLING, SPAN, reference_states, unseen_trajectories
 from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import NonFiniteError
 from dnnmso_mj.scenario import Scenario, Sinusoid
@@ -216,14 +216,15 @@ def test_weights_stay_to_the_last_bit_once_they_are_frozen(make_scenario, two_li
 
 
 def test_another_trajectory_begins_on_its_reference_with_the_learned_weights(
-    make_scenario, two_link, questions
+    make_scenario, two_link, questions, audited
 ):
-    scenario = make_scenario(**COARSE, duration=1.0)
-    learned = Simulation(scenario, two_link)
+    scenario = make_scenario(**COARSE, duration=AT)
+    learned = Simulation(scenario, two_link, watch=False)
     learned.run(MemoryRecorder(learned.layout, scenario.n_ticks))
     state = learned.controller.state()
-    elsewhere = other_trajectory(scenario, 1.0, questions.unseen[0])
-    simulation = Simulation(elsewhere, two_link)
+    unseen = questions.unseen[0]
+    elsewhere = other_trajectory(scenario, AT, unseen)
+    simulation = Simulation(elsewhere, two_link, watch=False)
     simulation.controller.restore(state)
     recorder = MemoryRecorder(simulation.layout, elsewhere.n_ticks)
     trace = recorder.trace(elsewhere, simulation.run(recorder))
@@ -231,6 +232,9 @@ def test_another_trajectory_begins_on_its_reference_with_the_learned_weights(
     assert trace["qd"][0] == pytest.approx(trace["qd_ref"][0])
     assert not trace["e_obs"][0].any()
     assert np.array_equal(simulation.controller.state()["weights"], state["weights"])
+    error = (trace["q"] - trace["q_ref"])[round(SETTLING / scenario.dt) :]
+    found = audited.paper.rows[0]["trajectories"][unseen.name]["frozen"]
+    assert found == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
 
 
 def test_the_audit_puts_its_own_freeze_in_the_place_of_others(make_scenario):
