@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from dnnmso_mj.audit.summary import AuditPoint
     from dnnmso_mj.sweep.statistics import Spread
 
-TIMES_SHOWN = 3  # side by side
+TIMES_SHOWN = 2  # side by side, in 80 columns
 
 
 def audit(
@@ -95,7 +95,7 @@ def _print_times(found: Audit, times: Sequence[float]) -> None:
     table = Table(
         title=f"{found.plan.name}: weights frozen, {seeds} seeds", box=None, pad_edge=False
     )
-    table.add_column("median, and its 95 % interval", no_wrap=True)
+    table.add_column("median, 95 % interval", no_wrap=True)
     for time in times:
         table.add_column(f"at {time:g} s", justify="right", no_wrap=True)
     for subject in found.plan.subjects:
@@ -110,7 +110,7 @@ def _print_times(found: Audit, times: Sequence[float]) -> None:
 def _cell(value: Spread) -> str:
     if value.median is None:
         return "none"
-    interval = "" if value.ci_low is None else f" {value.ci_low:.3g}–{value.ci_high:.3g}"
+    interval = "" if value.ci_low is None else f" {value.ci_low:.3g} to {value.ci_high:.3g}"
     return f"{value.median:.3g}{interval}"
 
 
