@@ -20,6 +20,16 @@ def scenarios_dir() -> Path:
     return _shipped("scenarios")
 
 
+def controllers_dir() -> Path:
+    """The folder of the shipped tuned controllers."""
+    return scenarios_dir() / "controllers"
+
+
+def shipped_controllers() -> list[str]:
+    """Names of the shipped tuned controllers."""
+    return _names(controllers_dir(), ".yaml")
+
+
 def logs_dir() -> Path:
     """Where logs go unless told otherwise: `logs` under the current directory."""
     return Path.cwd() / "logs"
@@ -67,6 +77,23 @@ def find_model(name: str, base: Path | None = None) -> Path:
     allowed = f"allowed: an MJCF file, or one of the shipped models: {', '.join(names)}"
     hint = did_you_mean(Path(name).stem, names)
     raise ScenarioError(f"no model {show(name)} in {clean(str(path.parent))}; {allowed}{hint}")
+
+
+def find_controller(name: str, base: Path) -> Path:
+    """Find a tuned controller by the name of a shipped one, or by path relative to `base`.
+
+    Raises:
+        ScenarioError: neither a file nor a shipped controller; lists what ships.
+    """
+    names = shipped_controllers()
+    path = base / name
+    if name not in names and _is_file(path):
+        return path
+    if name.removesuffix(".yaml") in names:
+        return controllers_dir() / f"{name.removesuffix('.yaml')}.yaml"
+    allowed = f"allowed: a YAML file, or one of the shipped controllers: {', '.join(names)}"
+    hint = did_you_mean(Path(name).stem, names)
+    raise ScenarioError(f"no such file in {clean(str(base))}; {allowed}{hint}")
 
 
 def model_name(path: Path) -> str:

@@ -173,7 +173,7 @@ def _write(items: Sequence[tuple[Path, Figure]]) -> dict[Path, OSError]:
     failed: dict[Path, OSError] = {}
     for path, figure in items:
         with house_style():
-            png = _png(figure)
+            png = png_bytes(figure)
         try:
             write_whole(path, png)
         except OSError as error:
@@ -181,8 +181,8 @@ def _write(items: Sequence[tuple[Path, Figure]]) -> dict[Path, OSError]:
     return failed
 
 
-def _png(figure: Figure) -> bytes:
-    """PNG of few colours: a fourth of the size, and nobody can tell."""
+def png_bytes(figure: Figure) -> bytes:
+    """A figure as PNG of few colours: a fourth of the size, and nobody can tell."""
     canvas: Any = FigureCanvasAgg(figure)  # its methods carry no types
     canvas.draw()
     size = canvas.get_width_height(physical=True)

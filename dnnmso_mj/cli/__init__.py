@@ -16,7 +16,19 @@ from typing import Annotated, NoReturn
 import typer
 
 from dnnmso_mj import __version__
-from dnnmso_mj.cli import audit, bench, check, logs, run, scenarios, sweep
+from dnnmso_mj.cli import (
+    audit,
+    bench,
+    check,
+    compare,
+    logs,
+    margins,
+    report,
+    run,
+    scenarios,
+    sweep,
+    tune,
+)
 from dnnmso_mj.cli.shared import BAD_INPUT, INTERRUPTED
 from dnnmso_mj.errors import DnnmsoError
 
@@ -135,6 +147,10 @@ def _root(
 # In the order of the help.
 app.command()(run.run)
 app.command()(sweep.sweep)
+app.command()(compare.compare)
+app.command()(margins.margins)
+app.command()(tune.tune)
+app.command()(report.report)
 app.command()(audit.audit)
 app.command()(check.check)
 app.command()(logs.plot)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from dnnmso_mj.simulate import Progress
+    from dnnmso_mj.sweep.statistics import Spread
 
 DIVERGED = 1
 BAD_INPUT = 2
@@ -71,3 +73,9 @@ def number(value: Any) -> str:
 def listing(items: Mapping[str, object]) -> str:
     """Names and values on one line."""
     return ", ".join(f"{name} {value}" for name, value in items.items())
+
+
+def plain_spread(spread: Spread) -> dict[str, Any]:
+    """A spread for JSON, which has no infinity: "inf" and "-inf" are texts in it."""
+    endless = {math.inf: "inf", -math.inf: "-inf"}
+    return {name: endless.get(value, value) for name, value in vars(spread).items()}

@@ -4,28 +4,22 @@ from __future__ import annotations
 
 import json
 import shlex
-import signal
 import sys
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dnnmso_mj.cli.shared import Json, Overrides, near, number, print_table, working
+from dnnmso_mj.cli.watching import how_to_go_on, terminated_like_ctrl_c, watching
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from dnnmso_mj.sweep.plan import Plan
     from dnnmso_mj.sweep.run import SweepResult
     from dnnmso_mj.sweep.statistics import Spread
     from dnnmso_mj.sweep.summary import Failure, PointSummary
-    from dnnmso_mj.sweep.task import Row
 
-LINE_PERIOD = 30.0  # s between lines of progress where there is no terminal
 POINTS_SHOWN = 12
 FAILURES_SHOWN = 10
 FAILURES_IN_JSON = 100
@@ -62,15 +56,15 @@ def sweep(
         plan = plan_sweep(scenario, parse_seeds(seeds), overrides or (), grid or ())
     out = out or default_out(plan)
     command = shlex.join(["dnnmso", *sys.argv[1:]])
-    with _watching(plan) as watcher:
+    with watching(plan.points[0].scenario.name) as watcher:
         try:
-            with _terminated_like_ctrl_c():
+            with terminated_like_ctrl_c():
                 result = run_sweep(
                     plan, out, runner, resume=resume, force=force, watcher=watcher, command=command
                 )
         except KeyboardInterrupt as stop:
             watcher.stop()
-            raise KeyboardInterrupt(_how_to_go_on(watcher, plan, out)) from stop
+            raise KeyboardInterrupt(how_to_go_on(watcher.done, plan.n_runs, out)) from stop
     with working("summing up"):
         points = summarise(result.table, plan)
     if as_json:
@@ -80,87 +74,6 @@ def sweep(
     bad = sum(len(point.failures) for point in points)
     if bad:
         print(f"{bad} of {plan.n_runs} runs diverged or failed", file=sys.stderr)
-
-
-class _Watch:
-    """Counts rows, and shows the count: a bar on a terminal, else a line now and then."""
-
-    def __init__(self, plan: Plan, bar: Progress | None) -> None:
-        self._name = plan.points[0].scenario.name
-        self._bar = bar
-        self.done, self.failures = 0, 0
-        self._total, self._kept, self._ticks = plan.n_runs, 0, 0
-        self._started = self._said = time.monotonic()
-
-    def begin(self, total: int, kept: int) -> None:
-        self.done = self._kept = kept
-        self._total = total
-        self._started = self._said = time.monotonic()
-        if self._bar is not None:
-            self._task = self._bar.add_task("", total=total, completed=kept, text=self._text())
-
-    def row(self, row: Row) -> None:
-        self.done += 1
-        self.failures += row["status"] != "ok"
-        self._ticks += row["ticks"]
-        if self._bar is not None:
-            self._bar.update(self._task, completed=self.done, text=self._text())
-        elif time.monotonic() - self._said > LINE_PERIOD:
-            self._said = time.monotonic()
-            print(f"{self._text()}, {self._left()} left", file=sys.stderr, flush=True)
-
-    def stop(self) -> None:
-        """Take the bar away before something else is said."""
-        if self._bar is not None:
-            self._bar.stop()
-
-    def _text(self) -> str:
-        passed = max(time.monotonic() - self._started, 1e-9)
-        rates = (
-            f"{(self.done - self._kept) / passed:.3g} runs/s, {self._ticks / passed:,.0f} ticks/s"
-        )
-        bad = f", {self.failures} diverged or failed" if self.failures else ""
-        return f"{self._name}: {self.done}/{self._total} runs, {rates}{bad}"
-
-    def _left(self) -> str:
-        passed = time.monotonic() - self._started
-        seconds = round(passed / max(self.done - self._kept, 1) * (self._total - self.done))
-        return f"{seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02}"
-
-
-@contextmanager
-def _watching(plan: Plan) -> Iterator[_Watch]:
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True, markup=False)
-    if not console.is_terminal:
-        yield _Watch(plan, None)
-        return
-    columns = (TextColumn("{task.fields[text]}", markup=False), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        yield _Watch(plan, bar)
-
-
-@contextmanager
-def _terminated_like_ctrl_c() -> Iterator[None]:
-    """Inside, SIGTERM (a scheduler's way to stop a job) is what Ctrl-C is."""
-
-    def interrupt(_number: int, _frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def _how_to_go_on(watch: _Watch, plan: Plan, out: Path) -> str:
-    words = [word for word in sys.argv[1:] if word not in {"--force", "--resume"}]
-    where = f" beside {near(out)}" if watch.done else ""
-    command = shlex.join(["dnnmso", *words, "--resume"])
-    return f"{watch.done} of {plan.n_runs} rows are kept{where}; to go on:\n  {command}"
 
 
 def _document(

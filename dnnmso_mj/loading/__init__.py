@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,30 +19,50 @@ from dnnmso_mj.loading.documents import Node, Problem, read_document
 from dnnmso_mj.loading.overrides import Override, apply_overrides, parse_overrides
 from dnnmso_mj.loading.places import Places
 from dnnmso_mj.loading.shape import Shape, lookup, scenario_schema
-from dnnmso_mj.paths import find_model, find_scenario, model_name, scenarios_dir
+from dnnmso_mj.loading.text import read_text
+from dnnmso_mj.loading.tuned import CONTROLLER, Graft, graft_file, graft_sets
+from dnnmso_mj.paths import (
+    find_controller,
+    find_model,
+    find_scenario,
+    model_name,
+    scenarios_dir,
+    shipped_controllers,
+)
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.wording import clean
+from dnnmso_mj.wording import did_you_mean, show
 
-__all__ = ["ScenarioWarning", "list_scenarios", "load_scenario", "located", "scenario_schema"]
-
-# ruamel.yaml takes time that grows with the square of a long tag: 1 s for 256 KiB, 13 s for 1 MiB.
-MAX_BYTES = 256 * 1024
+__all__ = [
+    "ScenarioWarning",
+    "controller_kinds",
+    "controller_set",
+    "kind_set",
+    "list_scenarios",
+    "load_scenario",
+    "located",
+    "scenario_schema",
+]
 
 
 class ScenarioWarning(UserWarning):
     """A scenario that can be run, but that no controller can do well."""
 
 
-def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario:
+def load_scenario(
+    source: str | Path, overrides: Sequence[str] = (), controller: str | None = None
+) -> Scenario:
     """Read, change and check a scenario.
 
     Args:
         source: a YAML file, or the name of a shipped scenario ("paper").
         overrides: `--set` strings, "plant.gravity=1.62"; see `dnnmso_mj.loading.overrides`.
+        controller: what replaces the scenario's own controller, before `overrides` change it: a
+            shipped tuned controller, a kind with its defaults, or a file.
 
     Returns:
         The scenario. Its plant.model is a shipped model's name or an absolute path. A relative
         path is taken from the scenario's folder in a file, from the current folder in a `--set`.
+        `controller: {from: NAME}` is replaced by what NAME holds; see `dnnmso_mj.loading.tuned`.
 
     Raises:
         ScenarioError: one line a problem, `FILE:LINE: key.path = VALUE: problem; allowed: ...`,
@@ -50,26 +72,60 @@ def load_scenario(source: str | Path, overrides: Sequence[str] = ()) -> Scenario
         ScenarioWarning: a torque limit under the static gravity load; gains that no step of dt
             can hold.
     """
-    sets = parse_overrides(overrides)
-    file = find_scenario(source)
-    root, problems = read_document(_read(file))
-    places = Places(file, root, sets)
-    if root is None or not isinstance(root.value, dict):
-        raise ScenarioError(places.message(problems or [_not_a_scenario(root)], []))
-    data = root.plain()
-    complaints = apply_overrides(data, sets)
-    complaints += _resolve_model(data, file, sets)
+    if controller is not None:
+        overrides = [controller_set(controller), *overrides]
+    draft = _draft(source, overrides)
+    data, places, complaints = draft.data, draft.places, draft.complaints
+    complaints += _resolve_model(data, draft.file, places.sets)
     scenario = None
     try:
         scenario = Scenario.model_validate(data)
     except ValidationError as error:
-        complaints += explain(error, data)
-    if scenario is None or complaints or problems:
-        raise ScenarioError(places.message(problems, complaints))
+        lost = draft.controller_lost  # that alone is said of it
+        complaints += [c for c in explain(error, data) if not lost or c.path[:1] != CONTROLLER]
+    if scenario is None or complaints or draft.problems:
+        raise ScenarioError(places.message(draft.problems, complaints))
     for path, problem in advice(scenario):
         message = places.message([], [complain(path, data, problem)])
         warnings.warn(message, ScenarioWarning, stacklevel=2)
     return scenario
+
+
+def controller_set(name: str) -> str:
+    """The `--set` that puts a controller in a scenario's place.
+
+    Args:
+        name: of a shipped tuned controller, a kind (its defaults), or a file; the first that fits.
+
+    Raises:
+        ScenarioError: none of them.
+    """
+    kinds, shipped = controller_kinds(), shipped_controllers()
+    if name in kinds and name not in shipped:
+        return kind_set(name)
+    try:
+        find_controller(name, Path.cwd())
+    except ScenarioError as error:
+        ways = [
+            f"a shipped one: {', '.join(shipped)}",
+            f"a kind with its defaults: {', '.join(kinds)}",
+            "or a YAML file",
+        ]
+        hint = did_you_mean(name, [*shipped, *kinds])
+        problem = f"no controller {show(name)}; allowed: {'; '.join(ways)}{hint}"
+        raise ScenarioError(problem) from error
+    return f"controller.from={json.dumps(name)}"
+
+
+def kind_set(kind: str) -> str:
+    """The `--set` that puts a kind of controller with its defaults in a scenario's place."""
+    return f"controller={{kind: {kind}}}"
+
+
+def controller_kinds() -> tuple[str, ...]:
+    """Every kind of controller."""
+    controller = Shape.root().child("controller")
+    return controller.choices if controller else ()
 
 
 def located(
@@ -81,17 +137,12 @@ def located(
         error: raised by what was built from the scenario; its text begins with a key path.
         source, overrides: what `load_scenario` made the scenario of.
     """
-    sets = parse_overrides(overrides)
-    file = find_scenario(source)
-    root, _ = read_document(_read(file))
-    data = root.plain() if root else {}
-    apply_overrides(data, sets)
+    draft = _draft(source, overrides)
     named = re.match(r"[a-z]\w*(\.\w+)*", str(error))
     path = tuple(named.group().split(".")) if named else ()
-    if not path or Shape.root().at(path, data) is None:
+    if not path or Shape.root().at(path, draft.data) is None:
         return error
-    complaint = Complaint(path, str(error))
-    return ScenarioError(Places(file, root, sets).message([], [complaint]))
+    return ScenarioError(draft.places.message([], [Complaint(path, str(error))]))
 
 
 def list_scenarios() -> list[tuple[str, str]]:
@@ -100,21 +151,35 @@ def list_scenarios() -> list[tuple[str, str]]:
     return [(file.stem, load_scenario(file).description) for file in files]
 
 
-def _read(file: Path) -> str:
-    name = clean(str(file))
-    try:
-        with file.open("rb") as stream:
-            raw = stream.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise ScenarioError(f"{name}: cannot be read: {error.strerror}") from error
-    if len(raw) > MAX_BYTES:
-        raise ScenarioError(f"{name}: too large for a scenario; allowed: {MAX_BYTES} bytes")
-    try:
-        return raw.decode("utf-8")
-    except UnicodeDecodeError as error:
-        line = raw.count(b"\n", 0, error.start) + 1
-        byte = raw[error.start]
-        raise ScenarioError(f"{name}:{line}: byte 0x{byte:02x}; allowed: text in UTF-8") from error
+@dataclass(frozen=True)
+class _Draft:
+    """A scenario before it is checked: its data, overridden, and what is wrong with it so far."""
+
+    file: Path
+    data: dict[str, Any]
+    places: Places
+    problems: list[Problem]
+    complaints: list[Complaint]
+    controller_lost: bool
+
+
+def _draft(source: str | Path, overrides: Sequence[str]) -> _Draft:
+    sets = parse_overrides(overrides)
+    file = find_scenario(source)
+    root, problems = read_document(read_text(file))
+    if root is None or not isinstance(root.value, dict):
+        problems = problems or [_not_a_scenario(root)]
+        raise ScenarioError(Places(file, root, sets).message(problems, []))
+    sets, brought, complaints = graft_sets(sets)
+    data = root.plain()
+    grafts: list[Graft] = []
+    if not any(item.path == CONTROLLER for item in sets):
+        grafts, more = graft_file(data, file.absolute().parent)
+        complaints += more
+    lost = bool(complaints)
+    complaints += apply_overrides(data, sets)
+    places = Places(file, root, sets, [*grafts, *brought])
+    return _Draft(file, data, places, problems, complaints, lost)
 
 
 def _not_a_scenario(root: Node | None) -> Problem:

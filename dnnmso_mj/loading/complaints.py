@@ -39,38 +39,44 @@ class Complaint:
     missing: bool = False
 
 
-def complain(path: KeyPath, data: Any, problem: str) -> Complaint:
+def complain(path: KeyPath, data: Any, problem: str, root: Shape | None = None) -> Complaint:
     """`key.path = VALUE: problem`, the value taken from `data` or from the defaults."""
     value, note = lookup(data, path), ""
     if value is ABSENT:
-        shape = Shape.root().at(path, data)
+        shape = (root or Shape.root()).at(path, data)
         value, note = (shape.default, " (the default)") if shape else (ABSENT, "")
     shown = "" if value is ABSENT else f" = {show(value)}{note}"
     return Complaint(path, f"{dotted(path)}{shown}: {problem}")
 
 
-def explain(error: ValidationError, data: Any) -> list[Complaint]:
-    """Every complaint of a failed validation of `data`, in pydantic's order."""
+def explain(error: ValidationError, data: Any, root: Shape | None = None) -> list[Complaint]:
+    """Every complaint of a failed validation of `data`, in pydantic's order.
+
+    Args:
+        error, data: what was refused.
+        root: what may stand in the whole document; a scenario's, unless given.
+    """
+    root = root or Shape.root()
     out: list[Complaint] = []
     for detail in error.errors(include_url=False, include_input=False):
-        path = _key_path(detail["loc"], data)
+        path = _key_path(detail["loc"], data, root)
         problems = detail.get("ctx", {}).get("problems")
         if problems is None:
-            out += _explain(detail, path, data)
+            out += _explain(detail, path, data, root)
             continue
         for below, problem in problems:
             whole = (*path, *(int(p) if p.isdecimal() else p for p in below.split(".")))
-            out.append(complain(whole, data, problem))
+            out.append(complain(whole, data, problem, root))
     return out
 
 
-def _key_path(loc: tuple[str | int, ...], data: Any) -> KeyPath:
+def _key_path(loc: tuple[str | int, ...], data: Any, root: Shape) -> KeyPath:
     """Where an error is in the file: without the tags of unions that pydantic puts in between.
 
     One number that stands for a list is checked as a list of one; its index is left out too.
     """
     path: list[str | int] = []
-    shape: Shape | None = Shape.root()
+    shape: Shape | None = root
     value = data
     for part in loc:
         if shape and shape.kinds:
@@ -84,17 +90,17 @@ def _key_path(loc: tuple[str | int, ...], data: Any) -> KeyPath:
     return tuple(path)
 
 
-def _explain(detail: ErrorDetails, path: KeyPath, data: Any) -> list[Complaint]:
+def _explain(detail: ErrorDetails, path: KeyPath, data: Any, root: Shape) -> list[Complaint]:
     kind = detail["type"]
     if kind.startswith("union_tag"):
         path = (*path, "kind")
     value = lookup(data, path)
     if kind == "extra_forbidden":
-        parent = Shape.root().at(path[:-1], data)
+        parent = root.at(path[:-1], data)
         keys = parent.of_kind(lookup(data, path[:-1])).keys if parent else ()
         allowed = f"allowed: {', '.join(keys)}{did_you_mean(path[-1], keys)}"
-        return [complain(path, data, f"unknown key; {allowed}")]
-    shape = Shape.root().at(path, data)
+        return [complain(path, data, f"unknown key; {allowed}", root)]
+    shape = root.at(path, data)
     allowed = shape.words if shape else "another value"
     if kind == "too_short" and not _is_short(value, detail["ctx"]["min_length"]):
         return []  # pydantic does not count entries that are wrong themselves
@@ -107,7 +113,7 @@ def _explain(detail: ErrorDetails, path: KeyPath, data: Any) -> list[Complaint]:
     if shape and shape.kinds and path[-1] != "kind" and value in choices:
         hint = f"; did you mean {dotted((*path, 'kind'))}={value}?"
     problem = f"{_what(kind, value)}; allowed: {allowed}{hint}"
-    return [complain(path, data, problem)]
+    return [complain(path, data, problem, root)]
 
 
 def _is_short(value: Any, least: int) -> bool:

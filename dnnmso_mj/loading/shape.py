@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaMode
 from pydantic_core import CoreSchema
 
@@ -26,6 +27,19 @@ _NOUNS = {
 }
 
 
+_FROM = {
+    "type": "object",
+    "description": "A tuned controller; further keys override it.",
+    "properties": {
+        "from": {
+            "type": "string",
+            "description": "A shipped tuned controller's name, or its path from this file.",
+        }
+    },
+    "required": ["from"],
+}
+
+
 class _Plain(GenerateJsonSchema):
     """Keys are their own titles."""
 
@@ -37,8 +51,15 @@ class _Plain(GenerateJsonSchema):
 
 
 def scenario_schema() -> dict[str, Any]:
-    """The JSON Schema (draft 2020-12) of a scenario; keys with a default are not required."""
-    return Scenario.model_json_schema(schema_generator=_Plain)
+    """The JSON Schema (draft 2020-12) of a scenario; keys with a default are not required.
+
+    A controller may also be one that `from` names; what is beside it is checked when it is loaded.
+    """
+    schema = Scenario.model_json_schema(schema_generator=_Plain)
+    kinds = schema["properties"]["controller"]
+    description = {"description": kinds.pop("description")} if "description" in kinds else {}
+    schema["properties"]["controller"] = {"anyOf": [kinds, _FROM], **description}
+    return schema
 
 
 @dataclass(frozen=True)
@@ -57,7 +78,12 @@ class Shape:
     @cache
     def root(cls) -> Shape:
         """The shape of a whole scenario."""
-        schema = scenario_schema()
+        return cls.of(Scenario)
+
+    @classmethod
+    def of(cls, model: type[BaseModel]) -> Shape:
+        """The shape of a whole document."""
+        schema = model.model_json_schema(schema_generator=_Plain)
         return cls(schema, schema["$defs"])
 
     @property
@@ -124,7 +150,9 @@ class Shape:
 
     @property
     def _target(self) -> Mapping[str, Any]:
-        ref = self.schema.get("$ref")
+        options = self.schema.get("anyOf", ())
+        group = options[0] if len(options) == 2 and options[1] == {"type": "null"} else self.schema
+        ref = group.get("$ref", self.schema.get("$ref"))
         return self.parts[ref.rsplit("/", 1)[-1]] if ref else self.schema
 
 
@@ -145,6 +173,8 @@ def _words(schema: Mapping[str, Any], plural: bool = False) -> str:
         return "one of: " + ", ".join(schema.get("enum", [schema.get("const")]))
     if "pattern" in schema:
         return "a name"
+    if "type" not in schema:
+        return "groups of keys" if plural else "a group of keys"
     if schema["type"] == "array":
         noun = "lists of" if plural else "a list of"
         return f"{noun} {_count(schema)}{_words(schema['items'], plural=True)}"

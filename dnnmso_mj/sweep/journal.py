@@ -11,25 +11,38 @@ import fcntl
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NoReturn, Self
+from typing import Any, NoReturn, Protocol, Self
 
 import pyarrow as pa
 import pyarrow.json
 
-from dnnmso_mj.sweep.plan import Plan, SweepError, seeds_text
-from dnnmso_mj.sweep.table import ROW_SCHEMA, is_table, read_table, unfinished_rows
+from dnnmso_mj.sweep.plan import SweepError, seeds_text
+from dnnmso_mj.sweep.table import SWEEP, Kind, is_table, read_table, unfinished_rows
 from dnnmso_mj.sweep.task import Row
 from dnnmso_mj.wording import show
 
 SYNC_PERIOD = 1.0  # s; of what the machine's own end may cost
 LISTED = 8
-BEGINNING = b'{"points": ['  # of every journal: `Plan.definition` as JSON
+BEGINNING = b'{"points": ['  # of every journal: a plan's definition as JSON
 
-_PARSE = pyarrow.json.ParseOptions(explicit_schema=ROW_SCHEMA, unexpected_field_behavior="error")
+
+class Planned(Protocol):
+    """What the rows of a table are to be of."""
+
+    @property
+    def points(self) -> Sequence[object]:
+        """Each has a row of every seed."""
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Ascending, each once."""
+
+    def definition(self) -> dict[str, Any]:
+        """Everything but the seeds that the numbers depend on, as JSON; the first key is points."""
 
 
 def journal_path(out: Path) -> Path:
@@ -45,6 +58,7 @@ class Journal:
     Args:
         out: the table to be.
         plan: what is swept.
+        kind: of the table.
         resume: whether to go on from what a journal or a finished table of the same plan holds.
         force: whether to start anew in spite of either.
 
@@ -53,19 +67,27 @@ class Journal:
             or the file cannot be written.
     """
 
-    def __init__(self, out: Path, plan: Plan, *, resume: bool = False, force: bool = False) -> None:
+    def __init__(
+        self,
+        out: Path,
+        plan: Planned,
+        kind: Kind = SWEEP,
+        *,
+        resume: bool = False,
+        force: bool = False,
+    ) -> None:
         if out.is_dir():
             raise SweepError(f"{out}: a folder; allowed: a file, as in sweep.parquet")
-        self._out, self._plan = out, plan
+        self._out, self._plan, self._kind = out, plan, kind
         self._path = journal_path(out)
         self._synced = time.monotonic()
         self.done: list[set[int]] = [set() for _ in plan.points]
-        if out.exists() and not is_table(out):
-            _refuse_foreign(out, "a table of `dnnmso sweep`")
+        if out.exists() and not is_table(out, kind):
+            _refuse_foreign(out, f"a table of `{kind.command}`")
         if out.exists() and not (resume or force):
             raise SweepError(f"{out}: exists; {_ways_out('a finished sweep')}")
         if self._path.exists() and not _is_journal(self._path):
-            _refuse_foreign(self._path, "a journal of `dnnmso sweep`")
+            _refuse_foreign(self._path, f"a journal of `{kind.command}`")
         with _writing(self._path):
             out.parent.mkdir(parents=True, exist_ok=True)
             self._file = _lock(self._path)
@@ -106,18 +128,20 @@ class Journal:
             self._synced = time.monotonic()
 
     def rows(self) -> pa.Table:
-        """Every row that is kept, of `ROW_SCHEMA`.
+        """Every row that is kept, of the kind's schema.
 
         Raises:
             SweepError: the file has been damaged.
         """
+        schema = self._kind.rows
         if self._size() <= self._first_row:
-            return ROW_SCHEMA.empty_table()
+            return schema.empty_table()
+        parse = pyarrow.json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="error")
         try:
             with self._path.open("rb") as stream:
                 stream.seek(self._first_row)
-                table = pyarrow.json.read_json(stream, parse_options=_PARSE)
-                return table.select(ROW_SCHEMA.names).cast(ROW_SCHEMA)
+                table = pyarrow.json.read_json(stream, parse_options=parse)
+                return table.select(schema.names).cast(schema)
         except (OSError, pa.ArrowException, ValueError) as error:
             self._damaged(error)
 
@@ -136,7 +160,7 @@ class Journal:
         with _writing(self._path):
             os.ftruncate(self._file, 0)
         finished = resume and self._out.exists()
-        rows = self._finished_rows() if finished else ROW_SCHEMA.empty_table()
+        rows = self._finished_rows() if finished else self._kind.rows.empty_table()
         self._write(json.dumps(self._plan.definition()))
         self._first_row = self._size()
         for row in rows.to_pylist():
@@ -164,9 +188,9 @@ class Journal:
 
     def _finished_rows(self) -> pa.Table:
         """The rows of a finished table, if it is of this sweep."""
-        table, provenance = read_table(self._out)
+        table, provenance = read_table(self._out, self._kind)
         self._check_same(provenance.get("definition"))
-        rows = unfinished_rows(table, len(self._plan.points))
+        rows = unfinished_rows(table, len(self._plan.points), self._kind)
         self._check_asked(rows)
         return rows
 
@@ -175,7 +199,7 @@ class Journal:
 
     def _check_same(self, before: Any) -> None:
         now = json.loads(json.dumps(self._plan.definition()))
-        found = list(_differences(before, now, ""))
+        found = list(differences(before, now, ""))
         if found:
             more = [f"… and {len(found) - LISTED} more"] if len(found) > LISTED else []
             listed = "\n  ".join(found[:LISTED] + more)
@@ -256,15 +280,15 @@ def _writing(path: Path) -> Iterator[None]:
         raise SweepError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def _differences(before: Any, now: Any, path: str) -> Iterator[str]:
+def differences(before: Any, now: Any, path: str) -> Iterator[str]:
     """Where two values of JSON differ, as `key.path: before; now: after`."""
     if isinstance(before, dict) and isinstance(now, dict):
         for key in before | now:
             below = f"{path}.{key}" if path else key
-            yield from _differences(before.get(key), now.get(key), below)
+            yield from differences(before.get(key), now.get(key), below)
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
         for k, (one, other) in enumerate(zip(before, now, strict=True)):
-            yield from _differences(one, other, f"{path}.{k}")
+            yield from differences(one, other, f"{path}.{k}")
     elif isinstance(before, list) and isinstance(now, list):
         yield f"{path}: {len(before)} entries; now: {len(now)}"
     elif before != now:

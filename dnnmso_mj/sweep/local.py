@@ -16,10 +16,11 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import wait
+from typing import Self
 
 from dnnmso_mj.sources import python_path
 from dnnmso_mj.sweep.plan import SweepError
-from dnnmso_mj.sweep.task import Row, Task, failed_row
+from dnnmso_mj.sweep.task import Row, Work, failed_row
 
 # The cores are shared out by the sweep; a library's own threads would only fight for them.
 ONE_THREAD = dict.fromkeys(
@@ -39,7 +40,7 @@ class LocalEngine:
     def __init__(self, jobs: int | None = None) -> None:
         self.jobs = jobs or len(os.sched_getaffinity(0))
 
-    def rows(self, tasks: Iterable[Task]) -> Generator[Row]:
+    def rows(self, tasks: Iterable[Work]) -> Generator[Row]:
         """Yield every run's row as it is finished; closing the generator ends the workers.
 
         A run whose process dies is tried once more, after all others; if that dies too, its row
@@ -48,35 +49,60 @@ class LocalEngine:
         Raises:
             SweepError: workers cannot be started.
         """
-        pool = _Pool(tasks)
-        try:
-            yield from pool.rows(self.jobs)
-        finally:
-            pool.kill()
+        with WorkerPool(self.jobs) as pool:
+            yield from pool.rows(tasks)
 
 
-class _Pool:
-    """The workers, what each has to do, and what is to be tried again."""
+class WorkerPool:
+    """Worker processes that stay for more tasks; a context manager that ends them.
 
-    def __init__(self, tasks: Iterable[Task]) -> None:
-        self._tasks = iter(tasks)
-        self._rest: deque[Task] = deque()  # of tasks whose process died
-        self._again: deque[Task] = deque()  # runs that were under way when it did
-        self._suspects: set[tuple[int, int]] = set()
+    Args:
+        jobs: how many at most; they are started when there is something to do.
+    """
+
+    def __init__(self, jobs: int) -> None:
+        self.jobs = jobs
         self._workers: list[_Worker] = []
+        self._begin(())
 
-    def rows(self, jobs: int) -> Iterator[Row]:
-        for _ in range(jobs):
-            self._start()
-        while self._workers:
-            speaking = wait([worker.pipe for worker in self._workers])
-            for worker in [worker for worker in self._workers if worker.pipe in speaking]:
-                yield from self._listen(worker)
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.kill()
+
+    def rows(self, tasks: Iterable[Work]) -> Generator[Row]:
+        """Yield every run's row as it is finished; see `LocalEngine.rows`.
+
+        Closing the generator before its end ends the workers; the next call starts others.
+        """
+        self._begin(tasks)
+        finished = False
+        try:
+            for worker in self._workers:
+                self._feed(worker)
+            while len(self._workers) < self.jobs and self._start():
+                pass
+            while busy := [worker.pipe for worker in self._workers if worker.busy]:
+                speaking = wait(busy)
+                for worker in [worker for worker in self._workers if worker.pipe in speaking]:
+                    yield from self._listen(worker)
+            finished = True
+        finally:
+            if not finished:
+                self.kill()
 
     def kill(self) -> None:
+        """End the workers, whatever they do."""
         for worker in self._workers:
             worker.kill()
         self._workers.clear()
+
+    def _begin(self, tasks: Iterable[Work]) -> None:
+        self._tasks = iter(tasks)
+        self._rest: deque[Work] = deque()  # of tasks whose process died
+        self._again: deque[Work] = deque()  # runs that were under way when it did
+        self._suspects: set[tuple[int, int]] = set()
 
     def _listen(self, worker: _Worker) -> Iterator[Row]:
         """Take one message, or the end, of a worker; give it more to do when it is done."""
@@ -94,26 +120,26 @@ class _Pool:
         if not worker.seeds:
             self._feed(worker)
 
-    def _start(self) -> None:
+    def _start(self) -> bool:
+        """One more worker, if there is a task for it."""
         task = self._next()
-        if task is not None:
-            try:
-                self._workers.append(_Worker(task))
-            except OSError as error:
-                raise SweepError(
-                    f"--jobs: worker process {len(self._workers) + 1} cannot be started: "
-                    f"{error.strerror or error}; allowed: fewer --jobs"
-                ) from error
+        if task is None:
+            return False
+        try:
+            self._workers.append(_Worker(task))
+        except OSError as error:
+            raise SweepError(
+                f"--jobs: worker process {len(self._workers) + 1} cannot be started: "
+                f"{error.strerror or error}; allowed: fewer --jobs"
+            ) from error
+        return True
 
     def _feed(self, worker: _Worker) -> None:
         task, worker.first = worker.first or self._next(), None
-        if task is None:
-            self._workers.remove(worker)
-            worker.kill()
-        else:
+        if task is not None:
             worker.give(task)
 
-    def _next(self) -> Task | None:
+    def _next(self) -> Work | None:
         if self._rest:
             return self._rest.popleft()
         task = next(self._tasks, None)
@@ -138,8 +164,8 @@ class _Pool:
 class _Worker:
     """One process, its task, and the seeds of it whose rows are still to come."""
 
-    def __init__(self, first: Task) -> None:
-        self.first: Task | None = first  # for when it is ready
+    def __init__(self, first: Work) -> None:
+        self.first: Work | None = first  # for when it is ready
         self.task = first
         self.seeds: deque[int] = deque()
         self.ready = False
@@ -156,7 +182,12 @@ class _Worker:
                 start_new_session=True,  # Ctrl-C is for the sweep to handle
             )
 
-    def give(self, task: Task) -> None:
+    @property
+    def busy(self) -> bool:
+        """Whether it has something to say before it is given more to do."""
+        return bool(self.seeds) or not self.ready
+
+    def give(self, task: Work) -> None:
         self.task, self.seeds = task, deque(task.seeds)
         with suppress(OSError):  # it is dead, as the next message will tell
             self.pipe.send(task)

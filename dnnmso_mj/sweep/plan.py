@@ -89,7 +89,6 @@ class Plan:
 
     def definition(self) -> dict[str, Any]:
         """Everything but the seeds that the numbers depend on, as JSON."""
-        versions = software_versions()
         points = [
             {
                 "parameters": point.parameters,
@@ -100,10 +99,18 @@ class Plan:
         return {
             "points": points,
             "models": {p.scenario.plant.model: p.mjcf.text for p in self.points},
-            "versions": {name: versions[name] for name in NUMBERS_DEPEND_ON},
-            "git_commit": git_commit(),
-            "source_sha256": sources_digest(),
+            **code_identity(),
         }
+
+
+def code_identity() -> dict[str, Any]:
+    """Which code the numbers of this installation come from."""
+    versions = software_versions()
+    return {
+        "versions": {name: versions[name] for name in NUMBERS_DEPEND_ON},
+        "git_commit": git_commit(),
+        "source_sha256": sources_digest(),
+    }
 
 
 def plan_sweep(
@@ -122,8 +129,8 @@ def plan_sweep(
         SweepError: seeds, or keys that are set twice.
     """
     axes = [_axis(text) for text in grid]
-    _check_keys(parse_overrides(sets), axes)
-    ordered = _ordered(seeds)
+    check_keys(parse_overrides(sets), axes)
+    ordered = ordered_seeds(seeds)
     models: dict[str, Mjcf] = {}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -155,7 +162,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             allowed = f"allowed: at most {MAX_SEEDS}; split a larger sweep by seeds"
             raise SweepError(f"--seeds {clean(text)}: too many; {allowed}")
         seeds += range(start, stop)
-    return _ordered(seeds)
+    return ordered_seeds(seeds)
 
 
 def seeds_text(seeds: Sequence[int]) -> str:
@@ -168,7 +175,12 @@ def seeds_text(seeds: Sequence[int]) -> str:
     return ",".join(pieces)
 
 
-def _ordered(seeds: Iterable[int]) -> tuple[int, ...]:
+def ordered_seeds(seeds: Iterable[int]) -> tuple[int, ...]:
+    """Seeds in ascending order.
+
+    Raises:
+        SweepError: none, one twice, or one out of range.
+    """
     ordered = sorted(seeds)
     if not ordered:
         raise SweepError("seeds: none; allowed: at least one")
@@ -220,8 +232,12 @@ def _split(text: str) -> list[str]:
     return [*pieces, text[start:]]
 
 
-def _check_keys(sets: Sequence[Override], axes: Sequence[tuple[Override, ...]]) -> None:
-    """Refuse a key that has two values, and a seed that `--seeds` would override."""
+def check_keys(sets: Sequence[Override], axes: Sequence[tuple[Override, ...]] = ()) -> None:
+    """Refuse a key that has two values, and a seed that `--seeds` would override.
+
+    Raises:
+        SweepError: such a key.
+    """
     grid = [axis[0].path for axis in axes]
     paths = [*(item.path for item in sets), *grid]
     if ("seed",) in paths:
@@ -251,13 +267,28 @@ def _point(
     texts = [item.text for item in values]
     with _typed_as_grid(texts):
         scenario = load_scenario(source, [*sets, *texts])
+    return ready_point(scenario, (*parse_overrides(sets), *values), models)
+
+
+def ready_point(
+    scenario: Scenario, overrides: Sequence[Override], models: dict[str, Mjcf]
+) -> Point:
+    """A point of a plan, checked down to its first tick.
+
+    Args:
+        scenario: what `overrides` made.
+        overrides: the point's parameters.
+        models: those read before, by name; a new one is added.
+
+    Raises:
+        ScenarioError: the model cannot be used, or does not fit the scenario.
+    """
     name = scenario.plant.model
     if name not in models:
         models[name] = Mjcf.read(find_model(name))
     # One tick refuses what the model refuses, and compiles once what every worker then loads.
     simulate(scenario.model_copy(update={"duration": scenario.dt}), models[name], watch=False)
     resolved = scenario.model_dump(mode="json")
-    overrides = (*parse_overrides(sets), *values)
     parameters = {".".join(item.path): _typed(item, resolved) for item in overrides}
     return Point(parameters, scenario, models[name])
 
@@ -266,6 +297,8 @@ def _typed(override: Override, resolved: Any) -> Any:
     """The value that was set, a whole number as a float where the scenario has floats."""
     value, there = override.value, resolved
     for key in override.path:
+        if isinstance(there, dict) and key not in there:
+            return value  # controller.from is gone when it has done its work
         there = there[int(key)] if isinstance(there, list) else there[key]
     if isinstance(there, list) and there and not isinstance(value, list):
         there = there[0]  # one number for all joints

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy import stats
 
 Array = np.ndarray
 
+QUARTILES = (25.0, 50.0, 75.0)
 CONFIDENCE = 0.95
 # Median and extremes of n values: the true median is between them with probability 1 - 2^(1-n),
 # so with fewer no interval between values that were seen holds 95 %.
@@ -36,25 +38,46 @@ class Spread:
 
 
 def spread(values: Array, seed: int = 0) -> Spread:
-    """Describe finite values (n,) by what outliers cannot move.
+    """Describe values (n,) by what outliers cannot move.
 
     The interval is the percentile bootstrap's, over `RESAMPLES` resamples; of more than
-    `MOST_TO_RESAMPLE` values, the exact one between two order statistics: the number of values
-    under the true median is binomial (n, 1/2).
+    `MOST_TO_RESAMPLE` values, or where some are infinite, the exact one between two order
+    statistics: the number of values under the true median is binomial (n, 1/2).
 
     Args:
-        values: shape (n,), in an order that does not depend on how they were made.
+        values: shape (n,), in an order that does not depend on how they were made; ±inf is a value
+            beyond all others, and the middle of -inf and inf is 0.
         seed: of the resampling, so that the same values give the same interval.
     """
     n = len(values)
     if n == 0:
         return Spread(0, None, None, None, None, None, None)
-    low, middle, high = np.percentile(values, [25.0, 50.0, 75.0]).tolist()
+    low, middle, high = _quartiles(values)
     if n < FEWEST_FOR_INTERVAL:
         return Spread(n, middle, low, high, None, None, None)
-    if n > MOST_TO_RESAMPLE:
+    if n > MOST_TO_RESAMPLE or not np.isfinite(values).all():
         return Spread(n, middle, low, high, *_order_statistics(values), "order statistics")
     return Spread(n, middle, low, high, *_bootstrap(values, seed), "bootstrap")
+
+
+def _quartiles(values: Array) -> list[float]:
+    if np.isfinite(values).all():
+        found: list[float] = np.percentile(values, QUARTILES).tolist()
+        return found
+    ordered = np.sort(values)
+    return [_between(ordered, percent) for percent in QUARTILES]
+
+
+def _between(ordered: Array, percent: float) -> float:
+    """A percentile of sorted values, some of them infinite, between the two that are nearest."""
+    place = (len(ordered) - 1) * percent / 100.0
+    low, high = float(ordered[math.floor(place)]), float(ordered[math.ceil(place)])
+    if low == high:
+        return low
+    if math.isinf(low) and math.isinf(high):
+        return 0.0
+    weight = place - math.floor(place)
+    return (1.0 - weight) * low + weight * high
 
 
 def _order_statistics(values: Array) -> tuple[float, float]:

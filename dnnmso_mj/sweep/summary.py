@@ -56,11 +56,13 @@ def summarise(table: pa.Table, plan: Plan) -> list[PointSummary]:
     """
     size = len(plan.seeds)
     return [
-        _point(table.slice(k * size, size), point.parameters) for k, point in enumerate(plan.points)
+        summarise_rows(table.slice(k * size, size), point.parameters)
+        for k, point in enumerate(plan.points)
     ]
 
 
-def _point(rows: pa.Table, parameters: Mapping[str, Any]) -> PointSummary:
+def summarise_rows(rows: pa.Table, parameters: Mapping[str, Any]) -> PointSummary:
+    """Some runs of a table, all with these parameters, as one point."""
     is_ok = pc.equal(rows["status"], "ok")
     good = rows.filter(is_ok)
     bad = rows.filter(pc.invert(is_ok)).select(["seed", "status", "reason"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,22 @@ import pyarrow.parquet as pq
 from dnnmso_mj.sweep.plan import Plan, SweepError
 
 METADATA_KEY = b"dnnmso_sweep"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of table.
+
+    Args:
+        command: what writes it.
+        key: of its provenance, JSON in the file's metadata.
+        rows: what a row is before its table is finished; begins with point and seed.
+    """
+
+    command: str
+    key: bytes
+    rows: pa.Schema
+
 
 # The names are `compute_metrics`' own.
 METRIC_TYPES: dict[str, pa.DataType] = {
@@ -44,6 +61,7 @@ ROW_SCHEMA = pa.schema(
         ("wall_s", pa.float64()),
     ]
 )
+SWEEP = Kind("dnnmso sweep", METADATA_KEY, ROW_SCHEMA)
 
 
 def finished_table(rows: pa.Table, plan: Plan, provenance: dict[str, Any]) -> pa.Table:
@@ -87,33 +105,33 @@ def write_table(table: pa.Table, out: Path) -> None:
         raise SweepError(f"{out}: cannot be written: {error.strerror or error}") from error
 
 
-def read_table(path: Path) -> tuple[pa.Table, dict[str, Any]]:
+def read_table(path: Path, kind: Kind = SWEEP) -> tuple[pa.Table, dict[str, Any]]:
     """A finished table and its provenance.
 
     Raises:
-        SweepError: not a table that a sweep has written.
+        SweepError: not a table of this kind.
     """
     try:
         table = pq.read_table(path)
-        return table, json.loads(table.schema.metadata[METADATA_KEY])
+        return table, json.loads(table.schema.metadata[kind.key])
     except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
-        raise SweepError(f"{path}: not a table of `dnnmso sweep`: {error}") from error
+        raise SweepError(f"{path}: not a table of `{kind.command}`: {error}") from error
 
 
-def is_table(path: Path) -> bool:
-    """Whether this is a regular file that a sweep has written as its table."""
+def is_table(path: Path, kind: Kind = SWEEP) -> bool:
+    """Whether this is a regular file that holds a finished table of this kind."""
     try:
-        return path.is_file() and METADATA_KEY in (pq.read_schema(path).metadata or {})
+        return path.is_file() and kind.key in (pq.read_schema(path).metadata or {})
     except (OSError, pa.ArrowException):
         return False
 
 
-def unfinished_rows(table: pa.Table, n_points: int) -> pa.Table:
-    """A finished table of `n_points` as rows of `ROW_SCHEMA`, to be added to."""
+def unfinished_rows(table: pa.Table, n_points: int, kind: Kind = SWEEP) -> pa.Table:
+    """A finished table of `n_points` as rows of `kind.rows`, to be added to."""
     per_point = max(1, len(table) // n_points)
     points = pa.array([k // per_point for k in range(len(table))], pa.int32())
-    columns = [points, *(table[name] for name in ROW_SCHEMA.names[1:])]
-    return pa.table(columns, schema=ROW_SCHEMA)
+    columns = [points, *(table[name] for name in kind.rows.names[1:])]
+    return pa.table(columns, schema=kind.rows)
 
 
 def _column(values: Sequence[Any]) -> pa.Array:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import Field, dataclass
+from typing import Any, ClassVar, Protocol
 
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf
@@ -17,6 +17,26 @@ from dnnmso_mj.simulate import simulate
 from dnnmso_mj.wording import clean
 
 Row = dict[str, Any]
+
+
+class Work(Protocol):
+    """What a worker process can be given: a picklable dataclass whose call yields one row a seed.
+
+    A row names its point and seed; those of runs whose process died are `failed_row`'s.
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+    @property
+    def point(self) -> int:
+        """What the runs are of; with the seed it names a run."""
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """In the order of the rows."""
+
+    def __call__(self) -> Iterator[Row]:
+        """Make the runs, in a process that has nothing but this."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +54,10 @@ class Task:
     scenario: Scenario
     mjcf: Mjcf
     seeds: tuple[int, ...]
+
+    def __call__(self) -> Iterator[Row]:
+        """See `run_task`."""
+        return run_task(self)
 
 
 def run_task(task: Task) -> Iterator[Row]:

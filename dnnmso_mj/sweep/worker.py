@@ -16,12 +16,13 @@ def main() -> None:
     """Serve tasks until the pipe is closed."""
     pipe = Connection(int(sys.argv[1]))
     warnings.simplefilter("ignore")  # the plan has warned; an overflow before a divergence is data
-    from dnnmso_mj.sweep.task import run_task
+    from dnnmso_mj.sweep.task import Work  # what cannot be imported is told before any run
 
     with suppress(EOFError, ConnectionError):
         pipe.send("ready")
         while True:
-            for row in run_task(pipe.recv()):
+            work: Work = pipe.recv()
+            for row in work():
                 pipe.send(row)
 
 

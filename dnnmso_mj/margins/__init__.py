@@ -1,0 +1,1 @@
+"""How much of each imperfection a controller stands: one bisection a controller, row and seed."""
