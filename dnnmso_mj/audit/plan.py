@@ -16,7 +16,6 @@ from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.loading.overrides import parse_overrides
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
-from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.simulate import simulate
 
 STATES = 400  # that a model is asked about inside, and as many outside
@@ -68,7 +67,7 @@ def plan_audit(
         AuditError: a freeze time, a seed or a controller that cannot be accepted.
     """
     _check(controllers, sets)
-    scenarios = [_load(source, sets, name) for name in controllers or (None,)]
+    scenarios = [load_scenario(source, sets, name) for name in controllers or (None,)]
     mjcf = Mjcf.read(find_model(scenarios[0].plant.model))
     names = controllers or [scenarios[0].controller.kind]
     times = _times(at, scenarios[0].dt)
@@ -95,11 +94,6 @@ def _questions(subject: Subject, at: tuple[float, ...]) -> Questions:
         near=region.draw_inside(STATES, rng),
         outside=region.draw_outside(STATES, rng),
     )
-
-
-def _load(source: str, sets: Sequence[str], controller: str | None) -> Scenario:
-    kind = [] if controller is None else [f"controller={{kind: {controller}}}"]
-    return load_scenario(source, [*kind, *sets])
 
 
 def _times(at: Sequence[float], dt: float) -> tuple[float, ...]:

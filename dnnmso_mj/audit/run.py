@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -11,6 +11,7 @@ from dnnmso_mj.audit.plan import AuditPlan
 from dnnmso_mj.audit.portrait import Portrait
 from dnnmso_mj.audit.subject import Findings, Questions, Row, Subject, examine
 from dnnmso_mj.audit.summary import AuditPoint, summarise
+from dnnmso_mj.sweep.local import LocalEngine
 from dnnmso_mj.sweep.task import failed_row
 
 
@@ -74,7 +75,7 @@ def run_audit(
         for seed in plan.seeds
     ]
     found: dict[tuple[int, int], Row] = {}
-    with closing(_rows(work, jobs)) as rows:
+    with closing(LocalEngine(jobs).rows(work)) as rows:
         for row in rows:
             found[row["point"], row["seed"]] = row
             if progress is not None:
@@ -99,16 +100,3 @@ def gather(plan: AuditPlan, done: Sequence[Row], wall_s: float) -> Audit:
         ),
         wall_s=wall_s,
     )
-
-
-def _rows(work: Sequence[Examination], jobs: int | None) -> Generator[Row]:
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor, as_completed
-
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
-        for done in as_completed([pool.submit(_listed, one) for one in work]):
-            yield from done.result()
-
-
-def _listed(one: Examination) -> list[Row]:
-    return list(one())
