@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 from dnnmso_mj.scenario.controller import effectiveness, inversion
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from dnnmso_mj.scenario import Scenario
 
 MAX_TICKS = 100_000_000
@@ -77,6 +79,9 @@ def _events(scenario: Scenario) -> Iterator[Problem]:
                 f"events.{k}.at",
                 f"is at the end or after it; allowed: below {scenario.duration:g} s",
             )
+        if event.kind == "push" and event.duration < scenario.dt * (1 - 1e-9):
+            allowed = f"allowed: dt = {scenario.dt} or more"
+            yield f"events.{k}.duration", f"is less than one step; {allowed}"
 
 
 def _sizes(scenario: Scenario) -> Iterator[Problem]:
@@ -95,8 +100,18 @@ def _vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:
         yield "plant.masses", len(scenario.plant.masses), {n}
     yield from _reference_vectors(scenario, n)
     yield from _controller_vectors(scenario, n)
-    if scenario.imperfections.torque_limit:
-        yield "imperfections.torque_limit", len(scenario.imperfections.torque_limit), {1, n}
+    yield from _numbers("imperfections", scenario.imperfections, n)
+    yield from _numbers("imperfections.friction", scenario.imperfections.friction, n)
+    for k, event in enumerate(scenario.events):
+        if event.kind == "push" and event.torque:
+            yield f"events.{k}.torque", len(event.torque), {1, n}
+
+
+def _numbers(path: str, part: BaseModel, n: int) -> Iterator[tuple[str, int, set[int]]]:
+    """Every list of a part: one number for all joints, or one for each."""
+    for name, values in part:
+        if isinstance(values, tuple):
+            yield f"{path}.{name}", len(values), {1, n}
 
 
 def _controller_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:

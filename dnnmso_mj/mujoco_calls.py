@@ -41,3 +41,5 @@ mj_RungeKutta = _function("mj_RungeKutta", types.int32)
 mj_fullM = _function("mj_fullM", _pointer)
 # (model, data, x, y, count): x = M⁻¹ y by the factors that mj_forward leaves.
 mj_solveM = _function("mj_solveM", _pointer, _pointer, types.int32)
+# (model, data, jacp, jacr, site): the site's Jacobian (3, n) into jacp; jacr may be 0.
+mj_jacSite = _function("mj_jacSite", _pointer, _pointer, types.int32)

@@ -47,6 +47,8 @@ INTEGRATORS = {
 }
 RK4, EULER = int(INTEGRATORS["rk4"]), int(INTEGRATORS["euler"])
 
+TIP = "tip"  # the site at the far end of the last link
+
 LOGGER = logging.getLogger(__name__)
 
 
@@ -114,6 +116,9 @@ def build_spec(plant: PlantSpec, dt: float, mjcf: Mjcf) -> mujoco.MjSpec:
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     if plant.masses is not None and plant.lengths is not None:
         set_links(spec, plant.links, plant.masses, plant.lengths)
+        if spec.site(TIP) is None:
+            tip = spec.body(f"link{len(plant.lengths)}")
+            tip.add_site(name=TIP, pos=[plant.lengths[-1], 0.0, 0.0])
     return spec
 
 
@@ -207,7 +212,8 @@ class Plant:
 
     Attributes:
         q, qd: joint angle (n,) rad and velocity (n,) rad/s: live, read-only views.
-        model: MuJoCo's model.
+        applied: torque (n,) N·m on the joints beside the motors': live, held until changed.
+        model: MuJoCo's model, this plant's own.
         view: the same robot for compiled code.
     """
 
@@ -221,6 +227,7 @@ class Plant:
         data = self._data = mujoco.MjData(self.model)
         self.q: Array = _read_only(data.qpos)
         self.qd: Array = _read_only(data.qvel)
+        self.applied: Array = data.qfrc_applied
         self.view = PlantView(
             model=self.model._address,
             data=data._address,
@@ -236,6 +243,10 @@ class Plant:
         mujoco.mj_resetData(self.model, self._data)
         self._data.qpos[:] = q
         self._data.qvel[:] = qd
+
+    def damp(self, viscous: Array) -> None:
+        """Give the joints viscous friction (n,) N·m·s/rad; every integrator takes it in."""
+        self.model.dof_damping[:] = viscous
 
     def acceleration(self, tau: Array) -> Array:
         """True q̈ (n,) rad/s² at the present state under τ (n,) N·m: a live view."""

@@ -17,15 +17,16 @@ from dnnmso_mj.compile_loop import compile_elsewhere
 from dnnmso_mj.compiling import CompileNotice
 from dnnmso_mj.controllers import (
     LEARNING,
-    MODEL_ALONE,
-    MODEL_FROZEN,
     Controller,
     Inputs,
     build_controller,
     compiled_ticks,
 )
 from dnnmso_mj.errors import NonFiniteError
-from dnnmso_mj.imperfections import build_actuators
+from dnnmso_mj.imperfections.actuators import build_actuators, start_actuators
+from dnnmso_mj.imperfections.loads import build_loads, start_loads
+from dnnmso_mj.imperfections.sensors import SensorBank, sense
+from dnnmso_mj.imperfections.tip import Tip
 from dnnmso_mj.plant import RK4, Mjcf, NominalModel, Plant
 from dnnmso_mj.reference import Reference
 from dnnmso_mj.scenario import Constant, Scenario
@@ -50,6 +51,7 @@ from dnnmso_mj.tick import (
     begin_tick,
     end_tick,
 )
+from dnnmso_mj.timeline import plan, tip_of_interest
 from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
 
 Array = np.ndarray
@@ -119,13 +121,18 @@ class Simulation:
             scenario.dt,
             first_order=self.plant.view.integrator != RK4,
         )
-        self._events = sorted(scenario.events, key=lambda event: event.at)
+        self._tip = (
+            Tip(self.plant.model, scenario.plant.model) if tip_of_interest(scenario) else None
+        )
+        self._sensors = SensorBank(scenario.imperfections, n, scenario.dt, scenario.seed, CHUNK)
         self._lookahead = lookahead(scenario.controller)
         reference = np.zeros((CHUNK, 3 * n))
         x, x_ref, xd_ref, e_track, f_true, f_err = np.zeros((6, 2 * n))
         self.world = World(
             plant=self.plant.view,
-            actuators=build_actuators(scenario.imperfections, n),
+            sensors=self._sensors.view,
+            actuators=build_actuators(scenario.imperfections, n, scenario.dt),
+            loads=build_loads(scenario, self.plant, self._tip),
             bounds=bounds,
             pace=pace,
             reference=reference,
@@ -149,6 +156,7 @@ class Simulation:
             timespec=np.zeros(2, np.int64),
             dt=scenario.dt,
         )
+        self._plan = plan(scenario, self.world.loads, self._tip, self.world.inputs.frozen)
         self._flags = dict.fromkeys(CHANGES, False)
         self._first_state: dict[str, Array] | None = None
 
@@ -205,16 +213,28 @@ class Simulation:
         scenario, world, n = self.scenario, self.world, self.scenario.n_joints
         x = np.zeros(2 * n)
         x[:n], x[n:] = scenario.initial.q, scenario.initial.qd
+        if self._tip is not None:
+            self._tip.carry(0.0)
         self.plant.reset(x[:n], x[n:])
-        self.controller.reset(x)
+        start_actuators(world.actuators)
+        start_loads(world.loads)
+        self._sensors.start(x)
         q_ref, qd_ref, _ = self.reference.sample(np.zeros(1))
         start_bounds(world.bounds, x - np.concatenate([q_ref[0], qd_ref[0]]))
         world.tau[:] = 0.0
         world.inputs.frozen[0] = LEARNING
         self._happened = 0
         world.counts[:] = 0
-        self._sample_reference(0)
+        self._begin_chunk(0)
+        self.controller.reset(self._first_reading(x))
         self._flags = dict.fromkeys(CHANGES, False)
+
+    def _first_reading(self, x: Array) -> Array:
+        """What the sensors say of the start x (2n,), and will say again at tick 0."""
+        reading = x.copy()
+        if not self._sensors.view.perfect:
+            sense(self._sensors.view, x, 0, 0, reading)
+        return reading
 
     def _loop(self, recorder: Recorder, progress: Progress | None) -> None:
         n_ticks, dt = self.scenario.n_ticks, self.scenario.dt
@@ -226,7 +246,7 @@ class Simulation:
             if first % snapshot_every == 0:
                 recorder.snapshot("controller", first * dt, self.controller.state())
             if first % CHUNK == 0 and first > 0:
-                self._sample_reference(first)
+                self._begin_chunk(first)
             ends = [first + block, n_ticks, self._happen(first, recorder)]
             ends += [(first // every + 1) * every for every in (CHUNK, snapshot_every)]
             count = min(ends) - first
@@ -237,20 +257,19 @@ class Simulation:
 
     def _happen(self, tick: int, recorder: Recorder) -> int:
         """Let every event up to this tick happen; the tick of the next one, or the last."""
-        dt = self.scenario.dt
-        for wanted in self._events[self._happened :]:
-            due = round(wanted.at / dt)
-            if due > tick:
-                return due
+        for happening in self._plan[self._happened :]:
+            if happening.tick > tick:
+                return happening.tick
             self._happened += 1
-            self.world.inputs.frozen[0] = MODEL_FROZEN if wanted.what == "model" else MODEL_ALONE
-            left = "" if wanted.what == "model" else ", and no disturbance is estimated"
-            recorder.event(Event(tick * dt, "info", f"learning ends{left}"))
+            happening.act()
+            recorder.event(Event(tick * self.scenario.dt, "info", happening.message))
         return self.scenario.n_ticks
 
-    def _sample_reference(self, first: int) -> None:
+    def _begin_chunk(self, first: int) -> None:
+        """Reference and random numbers of the ticks from `first` on."""
         world = self.world
         world.counts[CHUNK_START] = first
+        self._sensors.draw()
         t = np.arange(first, first + CHUNK) * self.scenario.dt
         world.reference[:] = np.hstack(self.reference.sample(t))
         if self._lookahead:

@@ -19,9 +19,11 @@ import numpy as np
 
 from dnnmso_mj.clock import now_ns, sleep_until
 from dnnmso_mj.compiling import compiled, copy, inner
-from dnnmso_mj.imperfections import Actuators, actuate
+from dnnmso_mj.imperfections.actuators import GIVEN, Actuators, actuate
+from dnnmso_mj.imperfections.loads import BEFORE, Loads, load
+from dnnmso_mj.imperfections.sensors import Sensors, sense
 from dnnmso_mj.inversion import solve_spd
-from dnnmso_mj.plant import Nominal, PlantView, forward, inertia, integrate, solve_inertia
+from dnnmso_mj.plant import Nominal, PlantView, inertia, integrate, solve_inertia
 from dnnmso_mj.theory import TrackingBounds, begin_period, end_period
 
 if TYPE_CHECKING:
@@ -59,7 +61,9 @@ class World(NamedTuple):
     """All that a tick touches but the controller; arrays, overwritten in place."""
 
     plant: PlantView
+    sensors: Sensors
     actuators: Actuators
+    loads: Loads
     bounds: TrackingBounds
     pace: Pace
     reference: Array  # (chunk, 3n): q_ref, q̇_ref and q̈_ref of each tick,
@@ -126,8 +130,8 @@ def begin_tick(world: World, k: int) -> bool:
     for j in range(n):
         world.x[j], world.x[n + j] = plant.q[j], plant.qd[j]
         inputs.tau[j] = world.tau[j]
+    sense(world.sensors, world.x, k, i, inputs.x)
     for j in range(2 * n):
-        inputs.x[j] = world.x[j]
         world.x_ref[j], world.xd_ref[j] = world.reference[i, j], world.reference[i, n + j]
         inputs.x_ref[j], inputs.xd_ref[j] = world.ahead[i, j], world.ahead[i, n + j]
         world.e_track[j] = world.x[j] - world.x_ref[j]
@@ -152,7 +156,7 @@ def end_tick(world: World, command: Command, k: int) -> bool:
     missed = world.pace.period_ns > 0 and _too_late(world, k)
     world.counts[MISSED] = 1 if missed else 0
     wanted = _watchdog(world) if missed else command.tau
-    saturated = actuate(world.actuators, wanted)
+    saturated = actuate(world.actuators, wanted, k)
     tau = world.actuators.tau
     largest = 0.0
     for j in range(tau.size):
@@ -163,7 +167,7 @@ def end_tick(world: World, command: Command, k: int) -> bool:
     if largest > MUJOCO_ZEROES_ABOVE:
         world.counts[STATUS] = TAU_TOO_LARGE
         return True
-    forward(world.plant, tau)
+    load(world.loads, world.plant, tau, world.dt)
     if k > 0:
         _end_period(world, tau)
     _true_dynamics(world, command, tau, saturated or missed)
@@ -206,21 +210,21 @@ def _watchdog(world: World) -> Array:
     n, tau = world.tau.size, world.qdd
     for j in range(n):
         if world.pace.watchdog == HOLD:
-            tau[j] = world.tau[j]
+            tau[j] = world.actuators.held[GIVEN, j]
         elif world.pace.watchdog == ZERO:
             tau[j] = 0.0
         else:
-            tau[j] = -world.pace.damping * world.x[n + j]
+            tau[j] = -world.pace.damping * world.inputs.x[n + j]
     return tau
 
 
 @inner
 def _end_period(world: World, tau: Array) -> None:
-    """The period before tick k ended with q̈ under the torque that was held until now."""
-    n = tau.size
+    """The period before tick k ended with q̈ under the torques that were held until now."""
+    n, loads = tau.size, world.loads
     change = world.f_true[:n]
     for j in range(n):
-        change[j] = world.tau[j] - tau[j]
+        change[j] = (world.tau[j] - tau[j]) + (loads.held[BEFORE, j] - loads.torque[j])
     solve_inertia(world.plant, change, world.qdd)
     for j in range(n):
         world.qdd[j] += world.plant.qacc[j]
@@ -240,15 +244,19 @@ def _effect(world: World, tau: Array, out: Array) -> None:
 
 @inner
 def _true_dynamics(world: World, command: Command, tau: Array, substituted: bool) -> None:
-    """f_true = Ẋ − B τ, and what the closed loop feels of it, f_err = Ẋ − B τ_cmd − f̂."""
+    """f_true = Ẋ − B τ, and what the closed loop feels of it, f_err = Ẋ − B τ_cmd − f̂.
+
+    B τ is the command's own where that acts and where its B is that of the true state.
+    """
     n = tau.size
+    other = substituted or not (world.actuators.prompt and world.sensors.perfect)
     if not world.inverts:
         _effect(world, command.tau, command.Bu[n:])
     for j in range(n):
         world.f_true[j], world.f_true[n + j] = world.x[n + j], world.plant.qacc[j]
     for j in range(2 * n):
         world.f_err[j] = world.f_true[j] - command.Bu[j] - command.f_hat[j]
-    if substituted:
+    if other:
         _effect(world, tau, world.qdd)
         for j in range(n):
             world.f_true[n + j] -= world.qdd[j]

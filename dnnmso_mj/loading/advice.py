@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import accumulate
 
 import numpy as np
 
@@ -18,14 +19,16 @@ def advice(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     """Key paths, and what is wrong with them."""
     for problem in _overloads(scenario):
         yield ("imperfections", "torque_limit"), problem
+    for problem in _stuck(scenario):
+        yield ("imperfections", "friction"), problem
     yield from _gains(scenario)
 
 
-def stretched_load(plant: Plant) -> np.ndarray:
+def stretched_load(plant: Plant, payload: float = 0.0) -> np.ndarray:
     """The largest static gravity load, of the arm stretched out level: N·m, shape (n,).
 
     Joint i carries g Σ_{j≥i} m_j d_ij, with d_ij the distance along the arm from joint i to link
-    j's centre of mass. Empty where the model brings its own masses.
+    j's centre of mass, and a payload (kg) at the tip. Empty where the model brings its own masses.
     """
     if plant.masses is None or plant.lengths is None:
         return np.zeros(0)
@@ -35,21 +38,45 @@ def stretched_load(plant: Plant) -> np.ndarray:
     joints = np.concatenate(([0.0], np.cumsum(lengths)[:-1]))
     arms = (joints + centres)[None, :] - joints[:, None]
     with np.errstate(over="ignore"):
-        load: np.ndarray = plant.gravity * np.triu(arms * np.array(plant.masses)).sum(axis=1)
+        moments = np.triu(arms * np.array(plant.masses)).sum(axis=1)
+        load: np.ndarray = plant.gravity * (moments + payload * (lengths.sum() - joints))
     return load
+
+
+def _most_carried(scenario: Scenario) -> float:
+    """The heaviest payload (kg) of a run; 0 if nothing is ever taken up."""
+    payloads = [event for event in scenario.events if event.kind == "payload"]
+    masses = [event.mass for event in sorted(payloads, key=lambda event: event.at)]
+    return max(accumulate(masses, initial=0.0))
 
 
 def _overloads(scenario: Scenario) -> Iterator[str]:
     """What to warn of: each joint whose limit is under its static load."""
-    limit = scenario.imperfections.torque_limit
-    load = stretched_load(scenario.plant)
+    limit, payload = scenario.imperfections.torque_limit, _most_carried(scenario)
+    load = stretched_load(scenario.plant, payload)
     if limit is None or load.size == 0:
         return
+    arm = f"the arm with {payload:.4g} kg at its tip" if payload else "the arm"
     for k, (most, needed) in enumerate(zip(expand(limit, load.size), load, strict=True), start=1):
         if most < needed:
             yield (
                 f"joint {k} is limited to {most:.4g} N·m, under the static gravity load of "
-                f"{needed:.4g} N·m of the arm stretched out level; no controller can hold it"
+                f"{needed:.4g} N·m of {arm} stretched out level; no controller can hold it"
+            )
+
+
+def _stuck(scenario: Scenario) -> Iterator[str]:
+    """What to warn of: each joint whose motor cannot overcome its dry friction."""
+    n, parts = scenario.n_joints, scenario.imperfections
+    if parts.torque_limit is None:
+        return
+    limits = expand(parts.torque_limit, n)
+    holds = expand(parts.friction.breakaway or parts.friction.coulomb, n)
+    for k, (most, held) in enumerate(zip(limits, holds, strict=True), start=1):
+        if held >= most:
+            yield (
+                f"joint {k} is held by {held:.4g} N·m, and its motor is limited to {most:.4g} N·m; "
+                "no controller can move it from rest"
             )
 
 

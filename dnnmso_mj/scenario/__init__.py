@@ -25,12 +25,11 @@ from dnnmso_mj.scenario.controller import (
     NoNetwork,
     Observer,
 )
-from dnnmso_mj.scenario.events import Event, Freeze
+from dnnmso_mj.scenario.events import Event, Freeze, Payload, Push
 from dnnmso_mj.scenario.fields import (
     FiniteEach,
     NonNegative,
     Positive,
-    PositiveEach,
     Positives,
     Strict,
     Vector,
@@ -38,6 +37,7 @@ from dnnmso_mj.scenario.fields import (
     expand,
     refusal,
 )
+from dnnmso_mj.scenario.imperfections import Friction, Imperfections
 
 __all__ = [
     "PAPER_MODEL",
@@ -48,6 +48,7 @@ __all__ = [
     "Effectiveness",
     "Event",
     "Freeze",
+    "Friction",
     "Imperfections",
     "Inertia",
     "Initial",
@@ -56,7 +57,9 @@ __all__ = [
     "Network",
     "NoNetwork",
     "Observer",
+    "Payload",
     "Plant",
+    "Push",
     "RealTime",
     "Reference",
     "Scenario",
@@ -169,13 +172,6 @@ class Waypoints(Strict):
 Reference = Annotated[Sinusoid | Setpoint | Waypoints, Field(discriminator="kind")]
 
 
-class Imperfections(Strict):
-    """What separates the simulation from a robot."""
-
-    torque_limit: PositiveEach | None = None
-    """Largest |torque| of each joint's actuator (N·m); null: none."""
-
-
 class Stall(Strict):
     """A hang of the controller, to see what follows from it."""
 
@@ -208,7 +204,7 @@ class Scenario(Strict):
     dt: Annotated[float, Field(ge=1e-5, le=0.1, allow_inf_nan=False)] = 0.001
     """Control period and integration step (s)."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Seed of the initial weights."""
+    """Seed of the initial weights, and of all noise."""
     plant: Plant = Plant()
     """The robot."""
     initial: Initial = Initial()
@@ -218,7 +214,7 @@ class Scenario(Strict):
     controller: Controller
     """What drives the robot."""
     imperfections: Imperfections = Imperfections()
-    """Limits of the robot's parts; none unless given."""
+    """What separates it from a robot; nothing unless given."""
     events: Annotated[tuple[Event, ...], BeforeValidator(as_tuple)] = ()
     """What happens at set times."""
     real_time: RealTime = RealTime()

@@ -56,6 +56,12 @@ FiniteEach = Annotated[
     BeforeValidator(_vector),
     _number_or_list({"type": "number"}),
 ]
+CountEach = Annotated[
+    tuple[Annotated[int, Field(ge=1)], ...],
+    Field(min_length=1),
+    BeforeValidator(_vector),
+    _number_or_list({"type": "integer", "minimum": 1}),
+]
 
 
 def expand(values: tuple[float, ...], size: int) -> np.ndarray:
