@@ -243,6 +243,25 @@ def test_the_audit_puts_its_own_freeze_in_the_place_of_others(make_scenario):
     assert [(event.at, event.what) for event in events] == [(2.0, "model")]
 
 
+def test_the_plant_stays_what_it_is_at_the_freeze(make_scenario, two_link, questions):
+    events = (
+        {"kind": "payload", "at": 0.5, "mass": 1.2},
+        {"kind": "push", "at": 0.7, "duration": 0.1, "torque": (5.0,)},
+        {"kind": "payload", "at": 4.0, "mass": -1.2},
+    )
+    scenario = same_trajectory(make_scenario(**COARSE, events=events), 2.0, "all")
+    assert [event.kind for event in scenario.events] == ["payload", "push", "freeze"]
+    elsewhere = other_trajectory(make_scenario(**COARSE, events=events), 2.0, questions.unseen[0])
+    assert [(e.kind, e.at) for e in elsewhere.events] == [("payload", 0.0), ("freeze", 0.0)]
+    loaded = TwoLink((1.0, 3.5), (1.0, 1.0))
+    states = np.random.default_rng(6).uniform(-1.0, 1.0, size=(5, 4))
+    formula = loaded.acceleration(states[:, :2], states[:, 2:], np.zeros(2))
+    for changed in (scenario, elsewhere):
+        simulation = Simulation(changed, two_link)
+        simulation.run(MemoryRecorder(simulation.layout, changed.n_ticks))
+        assert true_drift(simulation.plant, states) == pytest.approx(formula)
+
+
 def test_the_yardstick_has_the_controllers_gains_and_no_model(make_scenario):
     scenario = make_scenario({"kind": "dnn_mso", "inversion": {"K": 5.0, "lam": 3.0}})
     bare = without_model(scenario)
