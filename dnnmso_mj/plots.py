@@ -19,6 +19,7 @@ from dnnmso_mj.errors import DnnmsoError
 from dnnmso_mj.figures.drawing import house_style
 from dnnmso_mj.figures.theory import learning_figure, theory_figure
 from dnnmso_mj.figures.tracking import error_figure, torque_figure, tracking_figure
+from dnnmso_mj.files import write_whole
 from dnnmso_mj.trace import Trace
 
 _COLOURS = 64
@@ -174,21 +175,10 @@ def _write(items: Sequence[tuple[Path, Figure]]) -> dict[Path, OSError]:
         with house_style():
             png = png_bytes(figure)
         try:
-            _replace(path, png)
+            write_whole(path, png)
         except OSError as error:
             failed[path] = error
     return failed
-
-
-def _replace(path: Path, data: bytes) -> None:
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(data)
-        part.replace(path)
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
 
 
 def png_bytes(figure: Figure) -> bytes:

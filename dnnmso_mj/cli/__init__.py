@@ -17,6 +17,7 @@ import typer
 
 from dnnmso_mj import __version__
 from dnnmso_mj.cli import (
+    audit,
     bench,
     check,
     compare,
@@ -150,6 +151,7 @@ app.command()(compare.compare)
 app.command()(margins.margins)
 app.command()(tune.tune)
 app.command()(report.report)
+app.command()(audit.audit)
 app.command()(check.check)
 app.command()(logs.plot)
 app.command()(logs.replay)
