@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from dnnmso_mj.scenario import Scenario
 
 MAX_TICKS = 100_000_000
-STEP_GAINS = ("K_q", "K_v", "K_tau", "filter_v", "filter_tau")
+STEP_GAINS = ("K_q", "K_v", "K_tau")
 
 Problem = tuple[str, str]
 
