@@ -32,10 +32,10 @@ def bench_tick(quick: bool) -> list[Table]:
     return [_control_table(ticks, rounds), _tick_table(paper(ticks), rounds)]
 
 
-def paper(ticks: int, precision: str | None = None) -> Scenario:
-    """The paper's scenario, cut to so many ticks, in its own precision or another."""
+def paper(ticks: int, precision: str | None = None, controller: str | None = None) -> Scenario:
+    """The paper's scenario, cut to so many ticks; in another precision, by another controller."""
     sets = [] if precision is None else [f"controller.network.precision={precision}"]
-    return load_scenario("paper", [f"duration={ticks * 1e-3}", *sets])
+    return load_scenario("paper", [f"duration={ticks * 1e-3}", *sets], controller=controller)
 
 
 def loop_probe(scenario: Scenario, mjcf: Mjcf | None = None) -> Probe:
@@ -50,16 +50,22 @@ def loop_probe(scenario: Scenario, mjcf: Mjcf | None = None) -> Probe:
 
 def _control_table(ticks: int, rounds: int) -> Table:
     single, double = (paper(ticks, precision=name) for name in ("float32", "float64"))
+    memory = paper(ticks, controller="dnn_mso_replay")
     interpreter = "the interpreter: many small calls"
     contenders = [
         Contender("dnnmso_mj, float32", "vector arithmetic", partial(_compute, single)),
         Contender("dnnmso_mj, float64", "vector arithmetic", partial(_compute, double)),
+        Contender("dnn_mso_replay, float32", "the same, for each sample replayed too",
+                  partial(_compute, memory)),
         Contender("plain PyTorch, float32", interpreter, partial(_torch_compute, single)),
-    ]
+    ]  # fmt: skip
     return Table(
         name="control",
         title="Whole control step, as it runs inside the loop",
-        work="observer, network, inversion with M(q) from MuJoCo, learning; timed inside the loop",
+        work=(
+            "observer, network, inversion with M(q) from MuJoCo, learning; timed inside the loop; "
+            "dnn_mso_replay: the controller with memory, which learns from remembered states too"
+        ),
         unit="µs",
         rows=race(contenders, rounds),
         checks=_check_torch_loop(),
