@@ -197,7 +197,6 @@ def test_the_error_keeps_its_bound_from_the_models_error_alone(run, order, froze
     trace = run(order, frozen)
     worst = np.abs(error(trace)[6500:]).max()
     bound = bounds(trace, 6.5)
-    print("order", order, "frozen", frozen, "worst", worst, "bounds", bound)
     assert worst <= bound[order]
     if frozen:
         assert worst > 0.1 * bound[order]  # the bound says something
@@ -208,7 +207,6 @@ def test_a_law_of_lower_order_breaks_the_bound_of_a_higher_one(run):
         trace = run(order, True)
         worst = np.abs(error(trace)[6500:]).max()
         bound = bounds(trace, 6.5)
-        print("lower", order, worst, bound)
         assert worst <= bound[order]
         assert worst > bound[order + 1]
 
@@ -221,22 +219,68 @@ def test_with_a_wrong_inertia_the_bound_holds_of_an_error_that_contains_it(make_
     scenario = make_scenario(controller, duration=9.0, events=events)
     trace = simulate(scenario, two_link, watch=False)
     worst = np.abs(error(trace)[6500:]).max()
-    print("wrong", worst, bounds(trace, 6.5))
     assert worst <= bounds(trace, 6.5)[2]
+
+
+# ---- a wrong B ----
+
+
+def radius(g: float, order: int) -> float:
+    """Spectral radius of the sampled loop in (e, ė, z, LP[z]) where the plant's B₂ is g B₂."""
+    e, ed, z, zl = np.eye(4)
+    d_hat = (order > 0) * z + (order > 1) * (z - zl)
+    wanted = -GAIN * LAM * e - (GAIN + LAM) * ed - d_hat
+    qdd = g * wanted
+    rows = [
+        e + DT * ed + 0.5 * DT**2 * qdd,
+        ed + DT * qdd,
+        z + SHARE * (qdd - wanted - z),
+        zl + SHARE * (z - zl),
+    ]
+    return float(np.abs(np.linalg.eigvals(np.array(rows))).max())
+
+
+@pytest.mark.parametrize(("order", "least", "most"), [(1, 0.048, 26.8), (2, 0.094, 15.1)])
+def test_the_effectiveness_may_be_wrong_within_a_window(
+    make_scenario, two_link, order, least, most
+):
+    """As the eigenvalues of the sampled loop say; nothing is learned, all masses are g-fold."""
+    settled = {}
+    for g in (0.7 * least, 1.8 * least, 0.9 * most, 1.15 * most):
+        known = {"kind": "inertia", "masses": [g, 2.3 * g], "lengths": [1.0, 1.0]}
+        scenario = make_scenario(
+            spec(feed_forward=order, inversion={"effectiveness": known}),
+            duration=5.0,
+            initial={"q": [0.0, 1.0], "qd": [0.5, 0.0]},
+            events=[{"kind": "freeze", "at": 0.0, "what": "model"}],
+        )
+        trace = simulate(scenario, two_link, watch=False)
+        worst = np.abs(error(trace)).max(axis=1)
+        settled[g] = trace.info.status == "ok" and worst[4000:].max() < 0.5 * worst[:2000].max()
+    assert list(settled.values()) == [radius(g, order) < 1.0 for g in settled]
+    assert list(settled.values()) == [False, True, True, False]
+    assert radius(least, order) == pytest.approx(1.0, abs=2e-4)
+    assert radius(most, order) == pytest.approx(1.0, abs=2e-2)
 
 
 # ---- imperfections ----
 
 
 def test_a_torque_limit_winds_nothing_up(make_scenario, two_link):
-    """Told what acted, it learns nothing of the limit; told its own command, it does."""
-    scenario = make_scenario(spec(), duration=4.0, imperfections={"torque_limit": 60.0})
+    """Told what acted, it comes out of a limit that acts for long; told its own command, it fails.
+
+    The limit of 60 N·m is little more than the 54.9 that hold the arm still.
+    """
+    motion = FAST | {"frequency": 1.6, "amplitude": 1.0}
+    limits = {"torque_limit": 60.0}
+    scenario = make_scenario(spec(), duration=4.0, reference=motion, imperfections=limits)
     told, _ = watched_run(scenario, two_link)
     untold, _ = watched_run(scenario, two_link, told=False)
-    assert told["saturated"].sum() >= 3
-    f_err = [np.abs((t["f_true"] - t["f_hat"])[:300, 2:]).max() for t in (told, untold)]
-    print("limit", rms(error(told)[2000:]), rms(error(untold)[2000:]), f_err, told["saturated"].sum(), untold["saturated"].sum())
-    assert rms(error(told)[2000:]) < 2e-4
+    assert told.info.status == "ok"
+    assert told["saturated"].sum() > 100
+    assert not told["saturated"][1000:].any()
+    assert np.abs(error(told)[2000:]).max() < 3e-3
+    assert untold.info.status == "diverged" or rms(error(untold)[2000:]) > 0.03
 
 
 @pytest.fixture(scope="module")
@@ -249,29 +293,32 @@ def loaded(make_scenario, two_link):
 
 
 def test_it_learns_less_as_its_model_gets_better_and_more_after_a_payload(loaded):
+    """‖ΔW‖/‖W‖ of the present sample's update, and the rate of the remembered ones."""
     trace, watched = loaded
-    eta = watched["replay_eta"]
-    early, late, after = (eta[a:b].mean() for a, b in ((500, 1500), (7000, 8000), (8050, 8550)))
-    end = eta[13000:].mean()
-    u = trace["update_ratio"]
-    print("eta", early, late, after, end, [u[a:b].mean(axis=0) for a, b in ((500, 1500), (7000, 8000), (8050, 8550), (13000, 14000))])
+    spans = [(500, 1500), (7000, 8000), (8050, 8550), (13000, 14000)]
+    moved = [trace["update_ratio"][a:b].mean() for a, b in spans]
+    early, late, after, end = moved
+    assert late < 0.1 * early
+    assert after > 10 * late
+    assert end < 0.5 * after
+    early, late, after, _ = (watched["replay_eta"][a:b].mean() for a, b in spans)
     assert late < 0.5 * early
-    assert after > 2.0 * late
-    assert end < after
+    assert after > 2 * late
 
 
-def test_a_payload_replaces_what_is_remembered(loaded):
-    trace, watched = loaded
+def test_a_payload_replaces_what_is_remembered_of_the_states_met_again(loaded):
+    _, watched = loaded
     memory = watched.controller.ticks.parts.law.memory
     size = int(memory.counts[SIZE])
     x, label, stored = memory.x[:size], memory.label[:size], memory.stored[:size]
     newer = stored > memory.counts[CLOCK] * 8.5 / 14.0
-    print("memory", size, newer.mean(), trace.info)
-    f = ARM.acceleration(x[:, :2], x[:, 2:], np.zeros(2))
-    off = np.abs(label - f).max(axis=1)
-    print("labels off unloaded f: old", np.median(off[~newer]), "new", np.median(off[newer]))
-    assert newer.mean() > 0.8
-    assert np.median(off[~newer]) < 0.3 < np.median(off[newer])
+    off = {}
+    for arm in (ARM, LOADED):
+        f = arm.acceleration(x[:, :2], x[:, 2:], np.zeros(2))
+        off[arm] = np.abs(label - f).max(axis=1)
+    assert 0.7 < newer.mean() < 1.0  # the start is not met again
+    assert np.median(off[ARM][~newer]) < 0.1
+    assert np.median(off[ARM][newer]) > 1.0
 
 
 def test_compiled_and_interpreted_run_are_the_same_bit_for_bit(make_scenario, two_link, seen):
@@ -348,14 +395,12 @@ def test_arms_of_other_sizes_are_tracked(n):
     document = json.loads(chain_scenario(n, 4000).model_dump_json()) | {"controller": spec()}
     trace = simulate(Scenario.model_validate(document), chain_arm(n))
     assert trace.info.status == "ok"
-    print("chain", n, rms(error(trace)[2000:]))
     assert rms(error(trace)[2000:]) < 1e-3
 
 
 def test_it_tracks_without_a_model_of_the_inertia(make_scenario, two_link):
     controller = spec(inversion={"effectiveness": {"kind": "constant", "b": 0.5}})
     trace = simulate(make_scenario(controller, duration=6.0), two_link, watch=False)
-    print("constant", rms(error(trace)[3000:]))
     assert rms(error(trace)[3000:]) < 3e-4
 
 
@@ -376,7 +421,6 @@ def test_its_network_alone_holds_the_trajectory_it_has_learned(make_scenario, tw
     """Without memory, or with a memory of states undisplaced, the same network does not."""
     frozen = partial(frozen_rmse, make_scenario, two_link)
     alone = frozen()
-    print("frozen", alone)
     assert alone < 1e-3
     assert frozen(position_spread=0.0, velocity_spread=0.0) > 10 * alone
     assert frozen(samples=0) > 30 * alone

@@ -170,7 +170,7 @@ def lookup(data: Any, path: KeyPath) -> Any:
 
 def _words(schema: Mapping[str, Any], plural: bool = False) -> str:
     if "enum" in schema or "const" in schema:
-        return "one of: " + ", ".join(schema.get("enum", [schema.get("const")]))
+        return "one of: " + ", ".join(map(str, schema.get("enum", [schema.get("const")])))
     if "pattern" in schema:
         return "a name"
     if "type" not in schema:
