@@ -87,7 +87,7 @@ class DnnMsoReplay(Strict):
     """DNN-MSO with experience replay."""
     inversion: Inversion = Inversion()
     """From the desired dynamics to a torque."""
-    K2: PositiveEach = (60.0,)
+    K2: PositiveEach = (70.0,)
     """Observer gain (1/s): one number, or one for each of the 2n states."""
     network: ModelNetwork = ModelNetwork()
     """The learned dynamics."""
