@@ -84,7 +84,7 @@ def test_a_factor_multiplies_the_list_that_it_is_of():
     search = Search(replace(REQUEST, controller="slotine_li"))
     assert search.start["K_D"] == 1.0
     tried = search.with_values(search.start | {"K_D": 0.3}).controller
-    assert tried.K_D == pytest.approx((18.0, 7.5))  # of 60 and 25 N·m·s/rad
+    assert pytest.approx((18.0, 7.5)) == tried.K_D  # of 60 and 25 N·m·s/rad
     assert tried.Gamma == search.scenario.controller.Gamma
 
 
