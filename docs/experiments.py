@@ -10,21 +10,16 @@ command, code and controllers is not run again; one that was interrupted goes on
 from __future__ import annotations
 
 import argparse
-import hashlib
-import json
 import shlex
-import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from experiment_steps import ROOT, Step, run
 
 from dnnmso_mj.loading import controller_kinds
-from dnnmso_mj.provenance import git_commit
-from dnnmso_mj.sources import sources_digest
 
-ROOT = Path(__file__).parents[1]
 CORES = 2
 DT = 1e-3  # s, of every scenario here
 
@@ -61,12 +56,6 @@ START_UP = 8.0  # s of a command, its checks of controllers included
 SEARCHES = 12  # runs of one search of a margin
 AUDIT = 290.0  # s of simulated time that one controller and seed are audited for
 
-DROPPED = {  # of a short result: paths, the clock, and what stands beside it in the whole one
-    *("out", "storage", "files", "rows", "rows_kept", "trials_kept", "jobs", "engine"),
-    *("wall_s", "ticks_per_s", "compute_us_p50", "compute_us_p999", "deadline_misses"),
-}
-FAILURES = 3  # that a short result lists
-
 
 class Budget(NamedTuple):
     """How much of everything."""
@@ -80,16 +69,6 @@ class Budget(NamedTuple):
     durations: dict[str, float]  # s, where it is not the scenario's own
     optimizers: tuple[str, ...]
     at: tuple[float, ...]  # s
-
-
-class Step(NamedTuple):
-    """One command, and the files whose change makes its result another one."""
-
-    name: str
-    command: tuple[str, ...]
-    seconds: float
-    reads: tuple[Path, ...] = ()
-    resumes: bool = True
 
 
 FULL = Budget(
@@ -130,9 +109,12 @@ LENGTHS = {"paper": 10.0, "hard": 40.0, "literature/lewis": 10.0, "literature/lb
 
 def tuned() -> dict[str, tuple[str, tuple[str, ...]]]:
     """Name of each tuned controller -> its kind, and what is set of it."""
-    kinds = {f"{kind}_tuned": (kind, ()) for kind in controller_kinds()}
-    variants = {f"{name}_tuned": (kind, (put,)) for name, (kind, put) in VARIANTS.items()}
-    return kinds | variants
+    found: dict[str, tuple[str, tuple[str, ...]]] = {}
+    for kind in controller_kinds():
+        found[f"{kind}_tuned"] = (kind, ())
+    for name, (kind, put) in VARIANTS.items():
+        found[f"{name}_tuned"] = (kind, (put,))
+    return found
 
 
 def kind_of(name: str) -> str:
@@ -173,6 +155,7 @@ def steps(budget: Budget, *, all_there: bool) -> Iterator[Step]:
         yield _sweep(budget, kind)
     command = ("python", "docs/optimizers.py", *budget.optimizers)
     yield Step("optimizers", command, 240.0, (Path("docs/optimizers.py"),), resumes=False)
+    names = names[len(AS_PUBLISHED) :] or names
     for scenario in ("literature/lewis", "literature/lb_dnn"):
         yield _compare(budget, scenario, names, reads)
     yield _report(budget)
@@ -206,8 +189,11 @@ def _tune(budget: Budget) -> Iterator[Step]:
 
 def _compare(budget: Budget, scenario: str, names: list[str], reads: tuple[Path, ...]) -> Step:
     name, seeds = f"compare_{Path(scenario).name}", budget.seeds[scenario]
-    command = ("dnnmso", "compare", scenario, "--controllers", ",".join(names), "--seeds", seeds)
-    command += (*_lasting(budget, scenario), *_table(budget, name))
+    command = (
+        *("dnnmso", "compare", scenario, "--controllers", ",".join(names), "--seeds", seeds),
+        *_lasting(budget, scenario),
+        *_table(budget, name),
+    )
     simulated = LENGTHS[scenario] * count(seeds)
     reads = (*reads, Path(f"scenarios/{scenario}.yaml"))
     return Step(name, command, seconds(names, simulated), reads)
@@ -215,8 +201,11 @@ def _compare(budget: Budget, scenario: str, names: list[str], reads: tuple[Path,
 
 def _margins(budget: Budget, names: list[str], reads: tuple[Path, ...]) -> Step:
     seeds = budget.seeds["margins"]
-    command = ("dnnmso", "margins", "paper", "--controllers", ",".join(names), "--seeds", seeds)
-    command += (*_lasting(budget, "margins"), *_table(budget, "margins"))
+    command = (
+        *("dnnmso", "margins", "paper", "--controllers", ",".join(names), "--seeds", seeds),
+        *_lasting(budget, "margins"),
+        *_table(budget, "margins"),
+    )
     free = ("pd", "pid", "rise", "lewis_nn", "slotine_li", "concurrent_learning")
     rows = [5 if "constant" in name or kind_of(name) in free else 7 for name in names]
     simulated = FULL.durations["margins"] * count(seeds) * SEARCHES
@@ -236,8 +225,11 @@ def _audit(budget: Budget, names: list[str], reads: tuple[Path, ...]) -> Step:
 
 def _sweep(budget: Budget, kind: str) -> Step:
     name, seeds = f"weights_{kind}", budget.seeds["sweep"]
-    command = ("dnnmso", "sweep", "paper", "--set", f"controller={{kind: {kind}}}")
-    command += ("--seeds", seeds, *_lasting(budget, "sweep"), *_table(budget, name))
+    command = (
+        *("dnnmso", "sweep", "paper", "--set", f"controller={{kind: {kind}}}", "--seeds", seeds),
+        *_lasting(budget, "sweep"),
+        *_table(budget, name),
+    )
     return Step(name, command, seconds([kind], LENGTHS["paper"] * count(seeds)))
 
 
@@ -247,75 +239,6 @@ def _report(budget: Budget) -> Step:
     command = ("dnnmso", "report", *tables, "--out", f"{budget.folder / 'findings.html'}")
     reads = tuple(Path(table) for table in tables)
     return Step("report", command, START_UP, reads, resumes=False)
-
-
-def run(step: Step, budget: Budget) -> bool:
-    """Run a step unless its result is there; whether it is there now."""
-    result = ROOT / budget.folder / f"{step.name}.out"
-    started = result.with_suffix(".started")
-    stamp = _stamp(step)
-    print(f"\n## {step.name}\n$ {shlex.join(step.command)}", flush=True)
-    if result.exists() and _first_line(result) == stamp:
-        print("finished before", flush=True)
-        return True
-    begun = f"{stamp} {git_commit()}"
-    again = started.exists() and started.read_text() == begun
-    result.parent.mkdir(parents=True, exist_ok=True)
-    started.write_text(begun)
-    way = ("--resume" if again else "--force",) if step.resumes else ()
-    print(f"estimate {step.seconds:.0f} s on {CORES} idle cores", flush=True)
-    since = time.perf_counter()
-    program = {"dnnmso": ("-m", "dnnmso_mj"), "python": ()}[step.command[0]]
-    done = subprocess.run(  # noqa: S603
-        [sys.executable, *program, *step.command[1:], *way],
-        cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False,
-    )  # fmt: skip
-    wall = time.perf_counter() - since
-    if done.returncode != 0:
-        print(f"FAILED with status {done.returncode} after {wall:.0f} s", flush=True)
-        return False
-    result.write_text(f"{stamp}\n{done.stdout}")
-    _write_short(step, done.stdout, ROOT / budget.short)
-    print(f"took {wall:.0f} s", flush=True)
-    return True
-
-
-def _stamp(step: Step) -> str:
-    """Of the command, the code and the files that it reads."""
-    digest = hashlib.sha256(f"{shlex.join(step.command)}\0{sources_digest()}".encode())
-    for file in step.reads:
-        path = ROOT / file
-        digest.update(path.read_bytes() if path.exists() else b"none")
-    return digest.hexdigest()
-
-
-def _first_line(file: Path) -> str:
-    with file.open() as stream:
-        return stream.readline().strip()
-
-
-def _write_short(step: Step, output: str, folder: Path) -> None:
-    """What docs quote: JSON with few digits, or the text that a script prints."""
-    folder.mkdir(parents=True, exist_ok=True)
-    command = shlex.join(step.command)
-    if "--json" in step.command:
-        short = {"command": command, "result": shortened(json.loads(output))}
-        text = json.dumps(short, indent=1, sort_keys=True, ensure_ascii=False)
-        (folder / f"{step.name}.json").write_text(f"{text}\n")
-    elif step.command[0] == "python":
-        (folder / f"{step.name}.md").write_text(f"`{command}`\n\n{output}")
-
-
-def shortened(value: Any) -> Any:
-    """A result without paths and times, numbers in four digits, and few of the failures."""
-    if isinstance(value, dict):
-        kept = {key: below for key, below in value.items() if key not in DROPPED}
-        if "failures" in kept:
-            kept["failures"] = kept["failures"][:FAILURES]
-        return {key: shortened(below) for key, below in kept.items()}
-    if isinstance(value, list):
-        return [shortened(below) for below in value]
-    return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
 def main() -> None:
@@ -332,7 +255,7 @@ def main() -> None:
         total += step.seconds
         if given.list:
             print(f"{step.name}: {step.seconds:.0f} s\n  {shlex.join(step.command)}")
-        elif not run(step, budget):
+        elif not run(step, budget.folder, budget.short):
             failed.append(step.name)
     print(f"\nestimate of all: {total / 60:.0f} min on {CORES} idle cores")
     if failed:

@@ -157,7 +157,7 @@ def test_what_no_scenario_can_have_is_refused_with_the_key():
         ROWS["torque_limit"].changed(load_scenario("paper"), -1.0)
 
 
-# What a kind is told of the plant, with its defaults and with a constant B₂; None: it cannot have one.
+# Whether a kind is free of a model, with its defaults and with a constant B₂; None: it has none.
 MODEL_FREE = {
     "dnn_mso": (False, True),
     "no_network": (False, True),
