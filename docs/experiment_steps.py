@@ -105,14 +105,13 @@ def _write_short(step: Step, output: str, folder: Path) -> None:
 
 
 def tails(file: Path) -> dict[str, dict[str, dict[str, float | None]]]:
-    """The 99th percentile and the largest of some metrics for each controller; null: a lost run.
+    """The 99th percentile and the largest of some metrics by controller; null: of a lost run.
 
     Args:
         file: a table of runs, relative to the checkout.
     """
     table = pq.read_table(ROOT / file)
-    column = "controller" if "controller" in table.column_names else None
-    names = np.array(table[column].to_pylist() if column else ["all"] * len(table))
+    names = np.array(table["controller"].to_pylist())
     found: dict[str, dict[str, dict[str, float | None]]] = {}
     for name in sorted(set(names)):
         found[name] = {}

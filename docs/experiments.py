@@ -97,7 +97,7 @@ TINY = FULL._replace(
     trials=2,
     tuning_seeds="1000",
     seeds=dict.fromkeys(FULL.seeds, "0:2"),
-    durations=dict.fromkeys([*FULL.seeds, "tune"], 0.2),
+    durations={**dict.fromkeys([*FULL.seeds, "tune"], 0.2), "hard": 20.5},  # beyond its payload
     optimizers=(
         *("--seeds", "1", "--tuning-seeds", "1", "--depths", "1"),
         *("--rules", "madam,sgd", "--duration", "0.5"),
