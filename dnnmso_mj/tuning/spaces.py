@@ -63,7 +63,7 @@ SPACES: dict[str, Space] = {
     },
     "dnn_mso_replay": {
         **_INVERSION,
-        **_K2,
+        "K2": Range(5.0, 500.0),
         "madam.eta": Range(1e-5, 1e-2),
         "replay.eta": Range(1e-5, 1e-2),
         "rate.eta_min": Range(1e-6, 1e-3),
