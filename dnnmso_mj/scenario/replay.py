@@ -54,7 +54,7 @@ class Replay(Strict):
     """Time between two states that are remembered (s)."""
     eta: LearningRate = 0.0003
     """Largest learning rate of remembered states."""
-    error: Positive = 0.35
+    error: Positive = 0.2
     """Their RMS error (rad/s²) from which on the rate is the largest; it falls with its square."""
 
 
