@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from dnnmso_mj.scenario.backstepping import Backstepping
 from dnnmso_mj.scenario.controller import effectiveness, inversion
+from dnnmso_mj.scenario.replay import DnnMsoReplay
 from dnnmso_mj.scenario.rivals import Rival
 
 if TYPE_CHECKING:
@@ -60,11 +61,17 @@ def _times_below_dt(scenario: Scenario) -> Iterator[Problem]:
 
 def _observer_gain(scenario: Scenario) -> Iterator[Problem]:
     most = 2.0 / scenario.dt
-    if not hasattr(scenario.controller, "observer"):
-        return
-    if max(scenario.controller.observer.K2) >= most:
-        problem = f"makes a sampled observer unstable; allowed: K2 < 2/dt = {most:g}"
-        yield "controller.observer.K2", problem
+    for path, K2 in _observer_gains(scenario):
+        if max(K2) >= most:
+            yield path, f"makes a sampled observer unstable; allowed: K2 < 2/dt = {most:g}"
+
+
+def _observer_gains(scenario: Scenario) -> Iterator[tuple[str, tuple[float, ...]]]:
+    controller = scenario.controller
+    if hasattr(controller, "observer"):
+        yield "controller.observer.K2", controller.observer.K2
+    elif isinstance(controller, DnnMsoReplay):
+        yield "controller.K2", controller.K2
 
 
 def _step_gains(scenario: Scenario) -> Iterator[Problem]:
@@ -142,8 +149,8 @@ def _controller_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, 
             values = getattr(believed, name)
             if values:
                 yield f"{path}.effectiveness.{name}", len(values), {n}
-    if hasattr(controller, "observer"):
-        yield "controller.observer.K2", len(controller.observer.K2), {1, 2 * n}
+    for path, K2 in _observer_gains(scenario):
+        yield path, len(K2), {1, 2 * n}
     if isinstance(controller, Rival | Backstepping):  # each of their gains is of a joint
         yield from _numbers("controller", controller, n)
     for name, allowed in (("K_v", {1, n}), ("box", {1, 2 * n})):

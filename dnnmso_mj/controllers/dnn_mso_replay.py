@@ -56,12 +56,13 @@ from dnnmso_mj.network import initial_weights, network_shape
 from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, start
 from dnnmso_mj.plant import NominalModel, inertia
 from dnnmso_mj.prediction import Predictor, build_predictor, predict, report
-from dnnmso_mj.scenario import DnnMsoReplay
+from dnnmso_mj.scenario import DnnMsoReplay, Observer
 from dnnmso_mj.tick import closed_loop
 
 Array = np.ndarray
 
 ETA = 0  # the slot of `Net.settings`
+REPLAY_TIME = 0.1  # s, over which the error of replay is averaged
 
 
 class Law(NamedTuple):
@@ -73,7 +74,8 @@ class Law(NamedTuple):
     predictor: Predictor
     f_used: Array  # (2n,) f̂ + d̂, what the inversion takes for f
     acted: Array  # (n,) N·m, in the period before the measurement
-    d_hat: Array  # (n,) K₂ e_a
+    z: Array  # (n,) rad/s², K₂ e_a
+    d_hat: Array  # (n,) rad/s²
     z_lagged: Array  # (n,) rad/s², K₂ e_a through the observer's lag once more
     low_passed: Array  # (n,) ē
     f_lagged: Array  # (n,) rad/s², f̂ through the observer's lag
@@ -132,14 +134,15 @@ class DnnMsoReplayController:
     ) -> None:
         n, replay, rate = n_joints, spec.replay, spec.rate
         self._nominal = nominal  # keeps alive what compiled code knows by address
-        shape = network_shape(spec.network, 2 * n, n)
-        weights = initial_weights(shape, spec.network, np.random.default_rng(seed))
-        weights = weights.astype(spec.network.precision)
+        network = spec.network.as_network()
+        shape = network_shape(network, 2 * n, n)
+        weights = initial_weights(shape, network, np.random.default_rng(seed))
+        weights = weights.astype(network.precision)
         learner = KernelLearner(shape, weights, spec.madam, watch=watch)
         self.learner = learner
         self.n_layers = learner.shape.n_layers
         inversion = build_inversion(spec.inversion, n, nominal.view)
-        observer = build_observer(spec.observer, 2 * n, dt)
+        observer = build_observer(Observer(K2=spec.K2), 2 * n, dt)
         self._command = command_of(inversion, observer.e_obs, learner.monitors)
         self._law = Law(
             inversion=inversion,
@@ -154,6 +157,7 @@ class DnnMsoReplayController:
             predictor=build_predictor(spec.known_delay, n, dt),
             f_used=np.zeros(2 * n),
             acted=np.zeros(n),
+            z=np.zeros(n),
             d_hat=np.zeros(n),
             z_lagged=np.zeros(n),
             low_passed=np.zeros(n),
@@ -171,7 +175,7 @@ class DnnMsoReplayController:
             eta_replay=replay.eta,
             replay_error=replay.error,
             replay_sq=np.zeros(1),
-            replay_share=1.0 / 1000.0,
+            replay_share=-math.expm1(-dt / REPLAY_TIME / max(1, replay.samples)),
             average=-math.expm1(-dt / rate.average),
             samples=replay.samples,
             every=max(1, round(replay.every / dt)),
@@ -184,8 +188,10 @@ class DnnMsoReplayController:
         self.ticks = CompiledTicks(run_ticks, parts, DnnMsoReplayController.update)
 
     def reset(self, x: Array) -> None:
-        start(self._law.observer, x)
-        self._law.ticks[0] = 0
+        law = self._law
+        start(law.observer, x)
+        for array in (law.ticks, law.z_lagged, law.low_passed, law.predictor.tau):
+            array[:] = 0
 
     def update(self, inputs: Inputs) -> Command:
         update(self.ticks.parts, inputs)
@@ -200,6 +206,7 @@ class DnnMsoReplayController:
             "x_hat": law.observer.x_hat.copy(),
             "e_obs": law.observer.e_obs.copy(),
             "f_hat": self._command.f_hat.copy(),
+            "z_lagged": law.z_lagged.copy(),
             "low_passed": law.low_passed.copy(),
             "M": law.M.copy(),
             "ticks": law.ticks.copy(),
@@ -216,6 +223,7 @@ class DnnMsoReplayController:
         law = self._law
         law.observer.x_hat[:], law.observer.e_obs[:] = state["x_hat"], state["e_obs"]
         self._command.f_hat[:] = state["f_hat"]
+        law.z_lagged[:] = state["z_lagged"]
         law.low_passed[:], law.M[:] = state["low_passed"], state["M"]
         law.ticks[:], law.predictor.tau[:] = state["ticks"], state["torques"]
         law.replay_sq[:] = state["replay_sq"]
@@ -239,19 +247,16 @@ def observe(law: Law, command: Command, inputs: Inputs) -> None:
     copy(observer.x_hat, command.x_hat)
     for i in range(n):
         z = observer.gain[n + i] * observer.e_obs[n + i]
-        share = observer.dt * observer.gain[n + i]
-        law.z_lagged[i] += share * (z - law.z_lagged[i])
         law.d_hat[i] = z + law.lead * (z - law.z_lagged[i])
-        law.low_passed[i] = law.decay * law.low_passed[i] + (1.0 - law.decay) * law.d_hat[i]
+        law.z_lagged[i] += observer.dt * observer.gain[n + i] * (z - law.z_lagged[i])
+        law.low_passed[i] = law.decay * law.low_passed[i] + (1.0 - law.decay) * z
+        law.z[i] = z
 
 
 @inner
 def lag(law: Law, command: Command, x: Array) -> None:
     """f̂ and X through 1/(1 + s/K₂), in the observer's own Euler steps."""
     n = law.d_hat.size
-    if law.ticks[0] == 0:
-        copy(x, law.x_lagged)
-        copy(command.f_hat[n:], law.f_lagged)
     for i in range(n):
         share = law.observer.dt * law.observer.gain[n + i]
         law.f_lagged[i] += share * (command.f_hat[n + i] - law.f_lagged[i])
@@ -298,19 +303,18 @@ def keep_inertia(law: Law, q: Array) -> None:
 def learn(parts: Parts, inputs: Inputs) -> None:
     """From the present state, which the network has just seen, and from remembered ones."""
     law, net, n = parts.law, parts.net, parts.law.d_hat.size
-    observer, memory = law.observer, law.memory
+    memory = law.memory
     wrong = turning = 0.0
     for i in range(n):
         wrong += law.low_passed[i] ** 2
-        turning += (law.d_hat[i] - law.low_passed[i]) ** 2
+        turning += (law.z[i] - law.low_passed[i]) ** 2
     share = min(1.0, math.sqrt(wrong) / law.error)
     eta = law.eta_min + (law.eta_0 - law.eta_min) * share
     delta = output_at(net)
     output = forward(net, inputs.x)
     for i in range(n):
-        implied = observer.gain[n + i] * observer.e_obs[n + i]
-        net.deltas[delta + i] = output[i] - parts.command.f_hat[n + i] - implied
-        law.label[i] = law.f_lagged[i] + implied
+        net.deltas[delta + i] = output[i] - parts.command.f_hat[n + i] - law.z[i]
+        law.label[i] = law.f_lagged[i] + law.z[i]
     net.settings[ETA] = eta
     monitors.learn(net, parts.watch, parts.command.monitors)
     if law.ticks[0] % law.every == 0 and turning < law.error**2:
@@ -346,6 +350,9 @@ def update(parts: Parts, inputs: Inputs) -> None:
     output = forward(parts.mean, inputs.x)
     for i in range(n):
         command.f_hat[i], command.f_hat[n + i] = inputs.x[n + i], output[i]
+    if law.ticks[0] == 0:
+        copy(inputs.x, law.x_lagged)
+        copy(command.f_hat[n:], law.f_lagged)
     if inputs.frozen[0] == LEARNING:
         learn(parts, inputs)
     lag(law, command, inputs.x)

@@ -10,15 +10,17 @@ from dnnmso_mj.scenario.fields import PositiveEach, Strict, WeightScale, as_tupl
 
 MAX_WEIGHTS = 10_000_000
 
+HiddenWidths = Annotated[
+    tuple[Annotated[int, Field(ge=1, le=4096)], ...],
+    Field(min_length=1, max_length=32),
+    BeforeValidator(as_tuple),
+]
+
 
 class Network(Strict):
     """The deep network f̂ and its initial weights."""
 
-    hidden: Annotated[
-        tuple[Annotated[int, Field(ge=1, le=4096)], ...],
-        Field(min_length=1, max_length=32),
-        BeforeValidator(as_tuple),
-    ] = (64, 64, 64)
+    hidden: HiddenWidths = (64, 64, 64)
     """Width of each hidden layer; three hidden layers make the paper's four weight layers."""
     activation: Literal["sigmoid", "tanh", "relu"] = "sigmoid"
     """Activation of the hidden layers; the output layer is linear."""

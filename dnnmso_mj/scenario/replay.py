@@ -4,12 +4,37 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from dnnmso_mj.scenario.fields import NonNegative, Positive, Strict
+from dnnmso_mj.scenario.fields import NonNegative, Positive, PositiveEach, Strict, WeightScale
 from dnnmso_mj.scenario.inversion import Inversion
-from dnnmso_mj.scenario.learning import KinematicNetwork, ToldObserver
-from dnnmso_mj.scenario.optimizers import Madam
+from dnnmso_mj.scenario.learning import HiddenWidths, Network
+from dnnmso_mj.scenario.optimizers import Madam, check_resolvable
+
+LearningRate = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
+Delay = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+class ModelNetwork(Strict):
+    """The deep network of the n accelerations; the velocities are measured, not learned."""
+
+    hidden: HiddenWidths = (64, 64, 64)
+    """Width of each hidden layer."""
+    activation: Literal["sigmoid", "tanh", "relu"] = "sigmoid"
+    """Activation of the hidden layers; the output layer is linear."""
+    bias: bool = True
+    """Whether each layer sees a constant 1 beside its inputs."""
+    init_scale: WeightScale | None = None
+    """Kumar's constant: spread = init_scale/√fan_in. null: the activation's own (sigmoid 3.6)."""
+    first_output: WeightScale = 0.1
+    """Factor on the initial weights of the output layer: a small one keeps the first torque low."""
+    precision: Literal["float64", "float32"] = "float32"
+    """Arithmetic of the network."""
+
+    def as_network(self) -> Network:
+        """The same as the network of the paper's controller."""
+        same = {name: getattr(self, name) for name in Network.model_fields if hasattr(self, name)}
+        return Network(outputs="kinematic", output_scale=self.first_output, **same)
 
 
 class Replay(Strict):
@@ -21,32 +46,29 @@ class Replay(Strict):
     """How many states are remembered."""
     spacing: Positive = 0.02
     """Side of the cells of the state space (rad, rad/s) that keep one state each."""
-    position_spread: NonNegative = 0.004
+    position_spread: NonNegative = 0.002
     """Largest displacement of a replayed joint angle (rad)."""
     velocity_spread: NonNegative = 0.05
     """Largest displacement of a replayed joint velocity (rad/s)."""
     every: Positive = 0.005
     """Time between two states that are remembered (s)."""
-    eta: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 0.001
+    eta: LearningRate = 0.0003
     """Largest learning rate of remembered states."""
-    error: Positive = 1.0
+    error: Positive = 0.35
     """Their RMS error (rad/s²) from which on the rate is the largest; it falls with its square."""
 
 
 class Rate(Strict):
     """η = eta_min + (madam.eta - eta_min) min(1, ‖ē‖/error): it follows the observer's error."""
 
-    eta_min: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] = 1e-5
+    eta_min: LearningRate = 1e-5
     """Learning rate of a model without error."""
-    error: Positive = 0.3
+    error: Positive = 0.5
     """‖ē‖ (rad/s²) from which on the learning rate is madam.eta."""
     low_pass: Positive = 0.05
     """Time constant of ē, the low-passed K₂ e_a (s)."""
-    average: Positive = 0.1
+    average: Positive = 0.08
     """Time over which weights are averaged for use (s)."""
-
-
-Delay = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
 class KnownDelay(Strict):
@@ -65,9 +87,9 @@ class DnnMsoReplay(Strict):
     """DNN-MSO with experience replay."""
     inversion: Inversion = Inversion()
     """From the desired dynamics to a torque."""
-    observer: ToldObserver = ToldObserver()
-    """What the network learns against."""
-    network: KinematicNetwork = KinematicNetwork()
+    K2: PositiveEach = (60.0,)
+    """Observer gain (1/s): one number, or one for each of the 2n states."""
+    network: ModelNetwork = ModelNetwork()
     """The learned dynamics."""
     madam: Madam = Madam()
     """The weight update."""
@@ -76,9 +98,14 @@ class DnnMsoReplay(Strict):
     rate: Rate = Rate()
     """The learning rate."""
     feed_forward: Literal[0, 1, 2] = 2
-    """Whether the observer's K₂ e_a is added to f̂ in the inversion."""
+    """Order of the feed-forward of the observer's error: 1 adds K₂ e_a to f̂, 2 without its lag."""
     known_delay: KnownDelay = KnownDelay()
     """What is known of delays."""
+
+    @model_validator(mode="after")
+    def _learns(self) -> DnnMsoReplay:
+        check_resolvable(self.madam, self.network.precision)
+        return self
 
     @property
     def rule(self) -> Madam:
