@@ -209,14 +209,14 @@ REFUSED = {
     "half a character": ("", '1: name = "\\ud800": holds half a character (a surrogate); allowed'),
     "unknown kind": (
         "",
-        '3: reference.kind = "sinusiod": is none of the choices; allowed: one of: setpoint, '
-        "sinusoid, waypoints; did you mean 'sinusoid'?",
+        '3: reference.kind = "sinusiod": is none of the choices; allowed: one of: '
+        "exp_sinusoid, setpoint, sinusoid, waypoints; did you mean 'sinusoid'?",
     ),
     "no kind": (
         "",
         f"4: controller.kind: missing key; allowed: one of: {KINDS}",
     ),
-    "kind of a wrong type": ("", "3: reference.kind = [1]: is a list; allowed: one of: setpoint, "),
+    "kind of a wrong type": ("", "3: reference.kind = [1]: is a list; allowed: one of: exp_"),
     "kind of the inner union": (
         "  inversion:\n    effectiveness: {kind: const}\n",
         '7: controller.inversion.effectiveness.kind = "const": is none of the choices; allowed: '
