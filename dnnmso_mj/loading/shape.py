@@ -103,7 +103,7 @@ class Shape:
         if self.kinds:
             return tuple(self.kinds)
         const = (self._target["const"],) if "const" in self._target else ()
-        return tuple(self._target.get("enum", const))
+        return tuple(map(str, self._target.get("enum", const)))
 
     @property
     def default(self) -> Any:
@@ -170,7 +170,7 @@ def lookup(data: Any, path: KeyPath) -> Any:
 
 def _words(schema: Mapping[str, Any], plural: bool = False) -> str:
     if "enum" in schema or "const" in schema:
-        return "one of: " + ", ".join(schema.get("enum", [schema.get("const")]))
+        return "one of: " + ", ".join(map(str, schema.get("enum", [schema.get("const")])))
     if "pattern" in schema:
         return "a name"
     if "type" not in schema:
