@@ -73,10 +73,10 @@ FULL = Budget(
     folder=Path("logs/findings"),
     short=Path("docs/findings"),
     controllers=Path("scenarios/controllers"),
-    trials=30,
-    tuning_seeds="1000:1003",
+    trials=16,
+    tuning_seeds="1000:1002",
     seeds={
-        "paper": "0:100",
+        "paper": "0:50",
         "hard": "0:10",
         "margins": "0:5",
         "audit": "0:5",
