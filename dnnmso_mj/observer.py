@@ -9,6 +9,7 @@ The classical MSO (Eq. 4) is the same observer with f̂ = f(X̂) + B d̂.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -55,6 +56,26 @@ def build_observer(spec: ObserverSpec, n_states: int, dt: float) -> StateObserve
 def start(observer: StateObserver, x: Array) -> None:
     """Start at the measured state x (2n,): X̂₀ = X₀ (the paper's simulation section)."""
     copy(x, observer.x_hat)
+
+
+def begin(observer: StateObserver, inversion: DynamicInversion, x: Array) -> None:
+    """Start at the measured state x (2n,), with no torque commanded before."""
+    start(observer, x)
+    inversion.tau[:] = 0.0
+    if not inversion.constant:
+        inversion.B2_inv[:] = np.eye(inversion.tau.size)
+
+
+def held(observer: StateObserver, inversion: DynamicInversion) -> dict[str, Array]:
+    """What the two keep from one tick to the next, as arrays of a controller's state."""
+    kept = {"x_hat": observer.x_hat, "tau": inversion.tau, "B2_inv": inversion.B2_inv}
+    return {name: array.copy() for name, array in kept.items()}
+
+
+def hold(observer: StateObserver, inversion: DynamicInversion, state: Mapping[str, Array]) -> None:
+    """Put back what `held` gave."""
+    observer.x_hat[:] = state["x_hat"]
+    inversion.tau[:], inversion.B2_inv[:] = state["tau"], state["B2_inv"]
 
 
 @inner

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading import ScenarioWarning, load_scenario
 from dnnmso_mj.loading.advice import stretched_load
+from dnnmso_mj.loading.shape import Shape
 from dnnmso_mj.paths import models_dir, scenarios_dir
 from dnnmso_mj.scenario import Controller, DnnMso, NoNetwork, Plant, Scenario, Setpoint, Sinusoid
 from dnnmso_mj.simulate import simulate
@@ -207,14 +209,14 @@ REFUSED = {
     "half a character": ("", '1: name = "\\ud800": holds half a character (a surrogate); allowed'),
     "unknown kind": (
         "",
-        '3: reference.kind = "sinusiod": is none of the choices; allowed: one of: setpoint, '
-        "sinusoid, waypoints; did you mean 'sinusoid'?",
+        '3: reference.kind = "sinusiod": is none of the choices; allowed: one of: '
+        "exp_sinusoid, setpoint, sinusoid, waypoints; did you mean 'sinusoid'?",
     ),
     "no kind": (
         "",
         f"4: controller.kind: missing key; allowed: one of: {KINDS}",
     ),
-    "kind of a wrong type": ("", "3: reference.kind = [1]: is a list; allowed: one of: setpoint, "),
+    "kind of a wrong type": ("", "3: reference.kind = [1]: is a list; allowed: one of: exp_"),
     "kind of the inner union": (
         "  inversion:\n    effectiveness: {kind: const}\n",
         '7: controller.inversion.effectiveness.kind = "const": is none of the choices; allowed: '
@@ -711,3 +713,48 @@ def test_any_override_is_taken_or_refused(paths: list[list[str]], values: list[s
     sets = [f"{'.'.join(p)}={v}" for p, v in zip(paths, values, strict=False)]
     _, lines = attempt("paper", sets)
     assert all(line.startswith(("--set ", str(scenarios_dir()))) for line in lines)
+
+
+def every_place() -> Iterator[tuple[dict[str, Any], dict[str, Any], str]]:
+    """Each key that a scenario can have: a draft, the part of it that has the key, and the key."""
+
+    def within(
+        shape: Shape, path: tuple[str | int, ...], kinds: dict[tuple[str | int, ...], str]
+    ) -> Iterator[tuple[tuple[str | int, ...], dict[tuple[str | int, ...], str]]]:
+        for kind, alternative in shape.kinds.items():
+            yield from within(alternative, path, {**kinds, path: kind})
+        for key in shape.keys if not shape.kinds else ():
+            yield (*path, key), kinds
+            below = shape.child(key)
+            yield from within(below, (*path, key), kinds) if below else ()
+        entry = shape.child(0) if not shape.kinds else None
+        if entry and (entry.kinds or entry.keys):
+            yield from within(entry, (*path, 0), kinds)
+
+    for path, kinds in within(Shape.root(), (), {}):
+        draft: dict[str, Any] = {
+            "name": "x",
+            "reference": {"kind": "sinusoid"},
+            "controller": {"kind": "dnn_mso"},
+        }
+        part: Any = draft
+        for k, key in enumerate(path):
+            if path[:k] in kinds:
+                part["kind"] = kinds[path[:k]]
+            if k == len(path) - 1:
+                yield draft, part, key
+            elif path[k + 1] == 0:
+                part = part.setdefault(key, [{}])
+            else:
+                part = part[0] if key == 0 else part.setdefault(key, {})
+
+
+@pytest.mark.parametrize("value", [None, 5, {"kind": 5}, [None]], ids=str)
+def test_whatever_stands_at_any_key_is_taken_or_refused(scratch: Path, value: Any) -> None:
+    count = 0
+    for draft, part, key in every_place():
+        part[key] = value
+        scratch.write_text(json.dumps(draft))
+        attempt(scratch)
+        count += 1
+    assert count > 200

@@ -26,7 +26,16 @@ from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert, solve
 from dnnmso_mj.kernel import Net, forward, output_at
 from dnnmso_mj.learner import KernelLearner, build_learner
 from dnnmso_mj.monitors import Watch
-from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, correct, start
+from dnnmso_mj.observer import (
+    StateObserver,
+    advance,
+    begin,
+    build_observer,
+    compare,
+    correct,
+    held,
+    hold,
+)
 from dnnmso_mj.plant import Nominal, NominalModel, bias, inertia
 from dnnmso_mj.scenario import ClassicalMso
 from dnnmso_mj.scenario import Inversion as InversionSpec
@@ -93,7 +102,7 @@ class ClassicalMsoController:
             self.ticks = CompiledTicks(run_ticks, parts, ClassicalMsoController.update)
 
     def reset(self, x: Array) -> None:
-        start(self._law.observer, x)
+        begin(self._law.observer, self._law.inversion, x)
 
     def update(self, inputs: Inputs) -> Command:
         if self.ticks is not None:
@@ -109,10 +118,10 @@ class ClassicalMsoController:
         return drift(self._law, x, self.learner.predict(x).astype(float))
 
     def state(self) -> dict[str, Array]:
-        return {"x_hat": self._law.observer.x_hat.copy(), **self.learner.state()}
+        return {**held(self._law.observer, self._law.inversion), **self.learner.state()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        start(self._law.observer, state["x_hat"])
+        hold(self._law.observer, self._law.inversion, state)
         self.learner.restore(state)
 
 

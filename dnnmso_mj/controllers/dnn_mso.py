@@ -21,7 +21,16 @@ from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert
 from dnnmso_mj.kernel import Net, forward, output_at
 from dnnmso_mj.learner import KernelLearner, build_learner
 from dnnmso_mj.monitors import Watch
-from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, correct, start
+from dnnmso_mj.observer import (
+    StateObserver,
+    advance,
+    begin,
+    build_observer,
+    compare,
+    correct,
+    held,
+    hold,
+)
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.scenario import DnnMso
 from dnnmso_mj.tick import closed_loop
@@ -84,7 +93,7 @@ class DnnMsoController:
             self.ticks = CompiledTicks(run_ticks, parts, DnnMsoController.update)
 
     def reset(self, x: Array) -> None:
-        start(self.observer, x)
+        begin(self.observer, self.inversion, x)
 
     def update(self, inputs: Inputs) -> Command:
         if self.ticks is not None:
@@ -110,10 +119,10 @@ class DnnMsoController:
         return self.learner.predict(x)[-x.size // 2 :].copy()
 
     def state(self) -> dict[str, Array]:
-        return {"x_hat": self.observer.x_hat.copy(), **self.learner.state()}
+        return {**held(self.observer, self.inversion), **self.learner.state()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        start(self.observer, state["x_hat"])
+        hold(self.observer, self.inversion, state)
         self.learner.restore(state)
 
 

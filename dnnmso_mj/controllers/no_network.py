@@ -17,7 +17,16 @@ from dnnmso_mj.compiling import copy, inner
 from dnnmso_mj.controllers import Command, CompiledTicks, Inputs, command_of
 from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert
 from dnnmso_mj.monitors import Monitors
-from dnnmso_mj.observer import StateObserver, advance, build_observer, compare, correct, start
+from dnnmso_mj.observer import (
+    StateObserver,
+    advance,
+    begin,
+    build_observer,
+    compare,
+    correct,
+    held,
+    hold,
+)
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.scenario import NoNetwork
 from dnnmso_mj.tick import closed_loop
@@ -56,7 +65,7 @@ class NoNetworkController:
         self.ticks = CompiledTicks(run_ticks, self._parts, NoNetworkController.update)
 
     def reset(self, x: Array) -> None:
-        start(self._parts.observer, x)
+        begin(self._parts.observer, self._parts.inversion, x)
 
     def update(self, inputs: Inputs) -> Command:
         update(self._parts, inputs)
@@ -66,10 +75,10 @@ class NoNetworkController:
         return np.zeros(x.size // 2)
 
     def state(self) -> dict[str, Array]:
-        return {"x_hat": self._parts.observer.x_hat.copy()}
+        return held(self._parts.observer, self._parts.inversion)
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        start(self._parts.observer, state["x_hat"])
+        hold(self._parts.observer, self._parts.inversion, state)
 
 
 @inner

@@ -27,7 +27,7 @@ from dnnmso_mj.compiling import compiled, inner
 from dnnmso_mj.controllers import LEARNING, Command, CompiledTicks, Inputs, command_of
 from dnnmso_mj.controllers.classical_mso import Law, build_law, command_with, drift
 from dnnmso_mj.monitors import Monitors
-from dnnmso_mj.observer import start
+from dnnmso_mj.observer import begin, held, hold
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.scenario import RbfMso, expand
 from dnnmso_mj.tick import closed_loop
@@ -78,7 +78,7 @@ class RbfMsoController:
         self.ticks = CompiledTicks(run_ticks, self._parts, RbfMsoController.update)
 
     def reset(self, x: Array) -> None:
-        start(self._parts.law.observer, x)
+        begin(self._parts.law.observer, self._parts.law.inversion, x)
 
     def update(self, inputs: Inputs) -> Command:
         update(self._parts, inputs)
@@ -89,11 +89,12 @@ class RbfMsoController:
         return drift(self._parts.law, x, self._parts.rbf.d_hat)
 
     def state(self) -> dict[str, Array]:
-        x_hat, rbf = self._parts.law.observer.x_hat, self._parts.rbf
-        return {"x_hat": x_hat.copy(), "W": rbf.W.copy(), "centres": rbf.centres.copy()}
+        law, rbf = self._parts.law, self._parts.rbf
+        kept = held(law.observer, law.inversion)
+        return {**kept, "W": rbf.W.copy(), "centres": rbf.centres.copy()}
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        start(self._parts.law.observer, state["x_hat"])
+        hold(self._parts.law.observer, self._parts.law.inversion, state)
         self._parts.rbf.W[:] = state["W"]
         self._parts.rbf.centres[:] = state["centres"]
 

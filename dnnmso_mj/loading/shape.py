@@ -103,7 +103,7 @@ class Shape:
         if self.kinds:
             return tuple(self.kinds)
         const = (self._target["const"],) if "const" in self._target else ()
-        return tuple(self._target.get("enum", const))
+        return tuple(map(str, self._target.get("enum", const)))
 
     @property
     def default(self) -> Any:
