@@ -15,14 +15,15 @@ from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.memory import CLOCK, SIZE
-from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.scenario import DnnMsoReplay, Scenario
 from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
 
 Array = np.ndarray
 KIND = "dnn_mso_replay"
 ARM = TwoLink((1.0, 2.3), (1.0, 1.0))
 LOADED = TwoLink((1.0, 3.5), (1.0, 1.0))
-DT, K2, GAIN, LAM = 1e-3, 60.0, 7.5, 7.5
+DT, GAIN, LAM = 1e-3, 7.5, 7.5
+K2 = DnnMsoReplay(kind=KIND).K2[0]
 SHARE = K2 * DT  # of the newest value in the observer's lag
 CLOCKED = {"compute_us", "deadline_missed", "wake_late_us"}
 PAYLOAD = {"kind": "payload", "at": 8.0, "mass": 1.2}
@@ -240,11 +241,17 @@ def radius(g: float, order: int) -> float:
     return float(np.abs(np.linalg.eigvals(np.array(rows))).max())
 
 
-@pytest.mark.parametrize(("order", "least", "most"), [(1, 0.048, 26.8), (2, 0.094, 15.1)])
-def test_the_effectiveness_may_be_wrong_within_a_window(
-    make_scenario, two_link, order, least, most
-):
+def window(order: int) -> tuple[float, float]:
+    """The least and the largest g that the sampled loop stands."""
+    g = np.geomspace(1e-2, 1e2, 4001)
+    stands = g[[radius(each, order) < 1.0 for each in g]]
+    return stands[0], stands[-1]
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_effectiveness_may_be_wrong_within_a_window(make_scenario, two_link, order):
     """As the eigenvalues of the sampled loop say; nothing is learned, all masses are g-fold."""
+    least, most = window(order)
     settled = {}
     for g in (0.7 * least, 1.8 * least, 0.9 * most, 1.15 * most):
         known = {"kind": "inertia", "masses": [g, 2.3 * g], "lengths": [1.0, 1.0]}
@@ -259,8 +266,6 @@ def test_the_effectiveness_may_be_wrong_within_a_window(
         settled[g] = trace.info.status == "ok" and worst[4000:].max() < 0.5 * worst[:2000].max()
     assert list(settled.values()) == [radius(g, order) < 1.0 for g in settled]
     assert list(settled.values()) == [False, True, True, False]
-    assert radius(least, order) == pytest.approx(1.0, abs=2e-4)
-    assert radius(most, order) == pytest.approx(1.0, abs=2e-2)
 
 
 # ---- imperfections ----
