@@ -26,6 +26,7 @@ DT, GAIN, LAM = 1e-3, 7.5, 7.5
 K2 = DnnMsoReplay(kind=KIND).K2[0]
 SHARE = K2 * DT  # of the newest value in the observer's lag
 CLOCKED = {"compute_us", "deadline_missed", "wake_late_us"}
+REPLAY_ERROR = 0.5  # rad/s², from which on replay learns as fast as it may
 PAYLOAD = {"kind": "payload", "at": 8.0, "mass": 1.2}
 FAST = {"kind": "sinusoid", "frequency": 2.0, "amplitude": 0.5, "phase": [0.0, 1.57]}
 
@@ -55,6 +56,7 @@ class Watched:
             self.columns.setdefault(name, []).append(getattr(law, name).copy())
         for name, value in (
             ("replay_eta", self.controller.ticks.parts.net.settings[0]),
+            ("replay_sq", law.replay_sq[0]),
             ("remembered", law.memory.counts[SIZE]),
             ("x", inputs.x.copy()),
         ):
@@ -292,7 +294,11 @@ def test_a_torque_limit_winds_nothing_up(make_scenario, two_link):
 def loaded(make_scenario, two_link):
     """A fast motion that meets the same states again, with a payload from 8 of 14 s on."""
     scenario = make_scenario(
-        spec(), duration=14.0, reference=FAST, events=[PAYLOAD], initial={"q": [0.0, 0.5]}
+        spec(replay={"error": REPLAY_ERROR}),
+        duration=14.0,
+        reference=FAST,
+        events=[PAYLOAD],
+        initial={"q": [0.0, 0.5]},
     )
     return watched_run(scenario, two_link)
 
@@ -307,8 +313,17 @@ def test_it_learns_less_as_its_model_gets_better_and_more_after_a_payload(loaded
     assert after > 10 * late
     assert end < 0.5 * after
     early, late, after, _ = (watched["replay_eta"][a:b].mean() for a, b in spans)
-    assert late < 0.5 * early
-    assert after > 2 * late
+    assert late < 0.7 * early
+    assert after > 1.4 * late
+
+
+def test_the_rate_of_replay_goes_with_its_mean_square_error(loaded):
+    _, watched = loaded
+    rates = DnnMsoReplay(kind=KIND)
+    share = np.minimum(1.0, watched["replay_sq"][:-1] / REPLAY_ERROR**2)
+    expected = rates.rate.eta_min + (rates.replay.eta - rates.rate.eta_min) * share
+    assert np.allclose(watched["replay_eta"][1:], expected, rtol=1e-12)
+    assert share.min() < 0.9
 
 
 def test_a_payload_replaces_what_is_remembered_of_the_states_met_again(loaded):
