@@ -23,9 +23,11 @@ from dnnmso_mj.sweep.plan import parse_seeds
 LAST = 10.0  # s
 
 
-def last_error(name: str, controller: str | None, seed: int) -> float:
+def last_error(name: str, controller: str | None, sets: list[str], seed: int) -> float:
     """RMSE (rad) of the last 10 s of a run; infinite if it diverged."""
-    trace = simulate(load_scenario(name, [f"seed={seed}"], controller=controller), watch=False)
+    trace = simulate(
+        load_scenario(name, [*sets, f"seed={seed}"], controller=controller), watch=False
+    )
     if trace.info.status != "ok":
         return np.inf
     last = trace["t"] >= trace.scenario.duration - LAST
@@ -36,13 +38,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scenarios", nargs="+")
     parser.add_argument("--controller", help="in place of the scenario's own")
+    parser.add_argument("--set", action="append", default=[], help="as of dnnmso run")
     parser.add_argument("--seeds", default="0:10")
     parser.add_argument("--jobs", type=int)
     options = parser.parse_args()
     seeds = parse_seeds(options.seeds)
     with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
         for name in options.scenarios:
-            run = partial(last_error, name, options.controller)
+            run = partial(last_error, name, options.controller, options.set)
             errors = np.array(list(pool.map(run, seeds)))
             lost = int(np.isinf(errors).sum())
             median, most = np.median(errors), np.quantile(errors, 0.99, method="higher")
