@@ -179,7 +179,9 @@ def test_a_log_says_what_was_run_and_can_be_drawn_and_replayed(kind, tmp_path: P
     state = read_snapshots(logged.log)[-1].arrays
     assert set(state) == set(build_controller(imperfect(kind), arm()).state())
     assert trace.info.metrics["diverged"] is False
-    assert (trace.info.metrics["bound_violations"] is None) == (inversion(trace.scenario) is None)
+    assert (trace.info.metrics["bound_violations"] is None) == (
+        inversion(trace.scenario.controller) is None
+    )
     figures = run_figures(trace)
     assert ("learning" in figures) == bool(trace.n_layers)
     for figure in figures.values():
