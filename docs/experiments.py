@@ -78,14 +78,14 @@ FULL = Budget(
     seeds={
         "paper": "0:50",
         "hard": "0:10",
-        "margins": "0:5",
-        "audit": "0:5",
+        "margins": "0:3",
+        "audit": "0:4",
         "sweep": "0:1000",
         "literature/lewis": "0:10",
         "literature/lb_dnn": "0:2",
     },
     durations={"margins": 6.0},
-    optimizers=("--seeds", "5", "--tuning-seeds", "2", "--depths", "1,3,5,8"),
+    optimizers=("--seeds", "4", "--tuning-seeds", "1", "--depths", "1,3,8"),
     at=(10.0, 50.0),
 )
 TINY = FULL._replace(

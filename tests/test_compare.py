@@ -254,7 +254,7 @@ def test_the_command_ranks_and_leaves_a_table(tmp_path, files):
 
 def test_ctrl_c_keeps_rows_and_says_how_to_go_on(tmp_path):
     command = [str(DNNMSO), "compare", "paper", "--controllers", "no_network,dnn_mso"]
-    command += ["--seeds", "0:200", "--set", "duration=0.3", "--out", "x.parquet"]
+    command += ["--seeds", "0:200", "--set", "duration=3.0", "--out", "x.parquet"]
     process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     journal = tmp_path / "x.parquet.journal"
     wait_until(lambda: rows_in(journal) > 20)

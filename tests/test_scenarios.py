@@ -30,8 +30,9 @@ from dnnmso_mj.scenario import (
 )
 from dnnmso_mj.simulate import simulate
 
-FILES = sorted(scenarios_dir().glob("*.yaml"))
-NAMES = [file.stem for file in FILES]
+FOLDERS = (scenarios_dir(), scenarios_dir() / "literature")  # in the order of the list
+FILES = [file for folder in FOLDERS for file in sorted(folder.glob("*.yaml"))]
+NAMES = [str(file.relative_to(scenarios_dir()).with_suffix("")) for file in FILES]
 every_scenario = pytest.mark.parametrize("name", NAMES)
 
 
