@@ -7,7 +7,7 @@ PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint const
 SCENARIO ?= scenarios/paper.yaml
 PYTEST_ARGS ?=
 
-.PHONY: help run test check format figures schema build clean
+.PHONY: help run test check format figures experiments schema build clean
 
 help:
 	@echo "make run      install, run $(SCENARIO), print where the log and the figures are"
@@ -15,6 +15,7 @@ help:
 	@echo "make check    format, lint and type checks"
 	@echo "make format   format and fix what can be fixed"
 	@echo "make figures  draw the pictures of the README and docs anew"
+	@echo "make experiments  tune, compare and audit all that docs/findings.md quotes (about 45 minutes)"
 	@echo "make schema   write scenarios/scenario.schema.json anew"
 	@echo "make build    build wheel and sdist into dist/"
 	@echo "make clean    remove the environment and all caches"
@@ -36,6 +37,9 @@ format: $(VENV)/.installed-check
 
 figures: $(VENV)/.installed-test
 	$(BIN)/python docs/make_figures.py
+
+experiments: $(VENV)/.installed-test
+	$(BIN)/python docs/experiments.py
 
 schema: $(VENV)/.installed-run
 	$(BIN)/dnnmso schema > $(VENV)/schema.json

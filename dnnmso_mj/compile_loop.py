@@ -10,6 +10,7 @@ to the last bit, the first one too, no run compiles its own loop.
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -39,11 +40,19 @@ def compile_elsewhere(run: Any, arguments: tuple[Any, ...], scenario: Scenario, 
     with suppress(OSError):
         subprocess.run(
             [sys.executable, "-P", "-m", "dnnmso_mj.compile_loop"],
-            input=json.dumps([scenario.model_dump_json(), mjcf.text, mjcf.folder]).encode(),
+            input=json.dumps([_whole(scenario), mjcf.text, mjcf.folder]).encode(),
             env=os.environ | {"PYTHONPATH": python_path()},
             start_new_session=True,  # Ctrl-C is for us, and we end it
             check=False,
         )
+
+
+def _whole(scenario: Scenario) -> str:
+    """A scenario as JSON; one that was cut short lasts again until after all that happens in it."""
+    happens = [event.at for event in (*scenario.events, *scenario.real_time.stalls)]
+    ends = math.ceil(max(happens, default=0.0) / scenario.dt + 1.0) * scenario.dt
+    longer = scenario.model_copy(update={"duration": max(scenario.duration, ends)})
+    return longer.model_dump_json()
 
 
 def is_compiled(run: Any, arguments: tuple[Any, ...]) -> bool:

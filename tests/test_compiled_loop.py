@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 
 import dnnmso_mj
+from dnnmso_mj.compile_loop import _whole
 from dnnmso_mj.controllers import compiled_ticks
+from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.plant import Plant
+from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
 
 CLOCKED = {"compute_us", "deadline_missed", "wake_late_us"}
@@ -197,3 +200,12 @@ def test_the_run_that_compiles_is_the_run_that_loads_bit_for_bit(tmp_path):
     ]
     assert [bool(run.stderr) for run in runs] == [True, False]  # the first says that it compiles
     assert runs[0].stdout == runs[1].stdout
+
+
+def test_a_scenario_cut_short_of_its_events_can_be_compiled_elsewhere():
+    whole = load_scenario("hard")
+    tick = whole.model_copy(update={"duration": whole.dt})
+    read = Scenario.model_validate_json(_whole(tick))
+    assert read.events == whole.events
+    assert 20.0 < read.duration < 20.01
+    assert Scenario.model_validate_json(_whole(whole)) == whole

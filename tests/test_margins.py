@@ -13,7 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 from sweep_samples import dnnmso, rows_in
 
-from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.errors import ScenarioError
+from dnnmso_mj.loading import controller_kinds, load_scenario
 from dnnmso_mj.margins.cards import cell_text, interval_text, margins_of, rank, unfound, value_text
 from dnnmso_mj.margins.plan import MarginPlan, MarginTask, model_free, plan_margins
 from dnnmso_mj.margins.rows import ROWS, MarginError, is_model_free, nominal_model, parse_rows
@@ -21,6 +22,7 @@ from dnnmso_mj.margins.run import run_margins
 from dnnmso_mj.margins.search import HALVINGS, PRECISION, PROBES_BELOW, find_margin
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
+from dnnmso_mj.simulate import simulate
 from dnnmso_mj.sweep.journal import journal_path
 from dnnmso_mj.sweep.plan import SweepError
 
@@ -103,17 +105,51 @@ def test_the_torque_limit_shrinks_with_the_level():
 
 
 def test_rows_put_their_value_where_a_scenario_has_it():
-    scenario = load_scenario("paper")
-    document = scenario.model_dump()
-    for name, value in {"delay": 0.0125, "noise": 3.0, "friction": 2.0, "payload": 1.2}.items():
-        ROWS[name].change(document, scenario, value)
-    imperfections = document["imperfections"]
-    assert imperfections["actuator_delay"] == 0.0125  # s
-    assert imperfections["position_noise"] == pytest.approx((3e-4,))  # rad
-    assert imperfections["velocity_noise"] == pytest.approx((3e-3,))  # rad/s
-    friction = imperfections["friction"]
-    assert (friction["coulomb"], friction["viscous"]) == ((2.0,), (1.0,))
-    assert document["events"] == ({"kind": "payload", "at": 0.0, "mass": 1.2},)
+    scenario = load_scenario("paper", ["events=[{kind: push, at: 1, duration: 1, torque: [1, 0]}]"])
+
+    def changed(row: str, level: float):
+        found = ROWS[row].changed(scenario, level)
+        assert found.controller == scenario.controller
+        return found
+
+    assert changed("delay", 0.0125).imperfections.actuator_delay == 0.0125  # s
+    noise = changed("noise", 3.0).imperfections
+    assert noise.position_noise == pytest.approx((3e-4,))  # rad
+    assert noise.velocity_noise == pytest.approx((3e-3,))  # rad/s
+    friction = changed("friction", 2.0).imperfections.friction
+    assert (friction.coulomb, friction.viscous) == ((2.0,), (1.0,))
+    push, payload = changed("payload", 1.2).events
+    assert (push.kind, payload.kind, payload.at, payload.mass) == ("push", "payload", 0.0, 1.2)
+
+
+def test_noise_of_a_velocity_from_angles_is_that_of_the_angles():
+    scenario = load_scenario("paper", ["imperfections.velocity_from=difference"])
+    found = ROWS["noise"].changed(scenario, 2.0).imperfections
+    assert (found.position_noise, found.velocity_noise) == ((2e-4,), (0.0,))
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_more_of_every_imperfection_makes_another_motion(row):
+    """Of the true arm, and up to the largest level that is ever asked for."""
+    scenario = load_scenario("paper", ["duration=0.2"], controller="computed_torque")
+    mjcf = Mjcf.read(find_model(scenario.plant.model))
+    before = simulate(scenario, mjcf, watch=False)
+    spec = ROWS[row]
+    level = 1 / 40 if row == "torque_limit" else spec.start
+    after = simulate(spec.changed(scenario, level), mjcf, watch=False)
+    assert not np.array_equal(before["q"], after["q"])
+    spec.changed(scenario, spec.cap)
+
+
+def test_every_row_is_searched_on_a_real_arm():
+    sets = ["duration=0.2", "controller.effectiveness.masses=[1.0, 2.3]"]
+    scenario = load_scenario("paper", sets, controller="computed_torque")
+    mjcf = Mjcf.read(find_model(scenario.plant.model))
+    for name, spec in ROWS.items():
+        (found,) = MarginTask(0, scenario, mjcf, name, 0.5, (1,))()
+        assert found["status"] in {"found", "capped"}, (name, found)
+        if found["status"] == "found" and not spec.smaller:
+            assert found["margin"] < found["fails_at"] <= spec.at_cap
 
 
 def test_what_no_scenario_can_have_is_refused_with_the_key():
@@ -121,14 +157,55 @@ def test_what_no_scenario_can_have_is_refused_with_the_key():
         ROWS["torque_limit"].changed(load_scenario("paper"), -1.0)
 
 
-def test_no_masses_and_no_regressor_is_free_of_a_model():
-    assert not is_model_free(load_scenario("paper").controller)
-    assert is_model_free(load_scenario("paper", [CONSTANT]).controller)
+# Whether a kind is free of a model, with its defaults and with a constant B₂; None: it has none.
+MODEL_FREE = {
+    "dnn_mso": (False, True),
+    "no_network": (False, True),
+    "classical_mso": (False, None),
+    "rbf_mso": (False, None),
+    "lewis_nn": (True, None),
+    "dnn_mso_replay": (False, True),
+    "backstepping": (False, True),
+    "slotine_li": (False, None),  # the form of the arm is its regressor
+    "concurrent_learning": (False, None),
+    "pd": (True, None),
+    "pid": (True, None),
+    "computed_torque": (False, None),
+    "adrc": (False, True),
+    "sliding_mode": (False, True),
+    "rise": (True, None),
+    "l1": (False, True),
+}
 
-    class Adaptive:
-        regressor = "two_link"
 
-    assert not is_model_free(Adaptive())
+def test_it_is_known_of_every_kind_whether_it_has_a_model():
+    assert set(MODEL_FREE) == set(controller_kinds())
+
+
+@pytest.mark.parametrize("kind", MODEL_FREE)
+def test_no_masses_and_no_regressor_is_free_of_a_model(kind):
+    default, constant = MODEL_FREE[kind]
+    controller = load_scenario("paper", controller=kind).controller
+    assert is_model_free(controller) is default
+    above = "inversion." if hasattr(controller, "inversion") else ""
+    sets = [f"controller.{above}effectiveness={{kind: constant}}"]
+    if constant is None:
+        with pytest.raises(ScenarioError):
+            load_scenario("paper", sets, controller=kind)
+    else:
+        assert is_model_free(load_scenario("paper", sets, controller=kind).controller) is constant
+
+
+def test_a_variant_is_a_file_like_any_other_controller(tmp_path):
+    file = tmp_path / "no_network_constant.yaml"
+    file.write_text(
+        "controller: {kind: no_network, inversion: {effectiveness: {kind: constant, b: 0.5}}}\n"
+    )
+    names = [str(file), "no_network_tuned", "no_network"]
+    plan = plan_margins("setpoint", names, ["model_above"], [0], HELD)
+    assert model_free(plan) == (str(file),)
+    assert plan.controllers[str(file)].controller.inversion.effectiveness.b == 0.5
+    assert plan.controllers["no_network_tuned"].controller.inversion.K != (7.5,)
 
 
 @pytest.fixture(scope="module")

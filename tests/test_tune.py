@@ -26,8 +26,8 @@ from dnnmso_mj.sweep.task import Task, run_task
 from dnnmso_mj.tuning import TuneError, TuneInterrupted
 from dnnmso_mj.tuning.objective import LOST, OVER_LIMIT, Objective
 from dnnmso_mj.tuning.run import Tuned, default_storage, tune
-from dnnmso_mj.tuning.search import Request
-from dnnmso_mj.tuning.spaces import SPACES
+from dnnmso_mj.tuning.search import Request, Search
+from dnnmso_mj.tuning.spaces import SPACES, B
 
 SETS = ("duration=0.2",)
 REQUEST = Request(
@@ -59,9 +59,11 @@ def test_every_path_is_a_number_of_the_kind_within_its_range(kind):
     spec = load_scenario("paper", [kind_set(kind)]).controller.model_dump(mode="json")
     for path, reach in SPACES[kind].items():
         value = lookup(spec, tuple(path.split(".")))
+        assert isinstance(value, list) or not reach.factor, path
         value = value[0] if isinstance(value, list) and len(value) == 1 else value
-        assert isinstance(value, float), path
-        assert reach.low <= value <= reach.high, path
+        start = 1.0 if reach.factor else value
+        assert isinstance(start, float), path
+        assert reach.low <= start <= reach.high, path
         assert 0 < reach.low < reach.high or not reach.log, path
 
 
@@ -69,8 +71,32 @@ def test_every_path_is_a_number_of_the_kind_within_its_range(kind):
 @pytest.mark.parametrize("end", ["low", "high"])
 @pytest.mark.parametrize("kind", SPACES)
 def test_every_range_can_be_searched_to_its_ends(kind, end):
-    ends = [f"controller.{path}={getattr(reach, end)!r}" for path, reach in SPACES[kind].items()]
-    load_scenario("paper", [kind_set(kind), *ends])
+    search = Search(replace(REQUEST, controller=kind))
+    values = {path: getattr(reach, end) for path, reach in search.space.items()}
+    tried = search.with_values(values).controller.model_dump(mode="json")
+    for path, value in values.items():
+        found = lookup(tried, tuple(path.split(".")))
+        if not search.space[path].factor:
+            assert found in (value, [value]), path
+
+
+def test_a_factor_multiplies_the_list_that_it_is_of():
+    search = Search(replace(REQUEST, controller="slotine_li"))
+    assert search.start["K_D"] == 1.0
+    tried = search.with_values(search.start | {"K_D": 0.3}).controller
+    assert pytest.approx((18.0, 7.5)) == tried.K_D  # of 60 and 25 N·m·s/rad
+    assert tried.Gamma == search.scenario.controller.Gamma
+
+
+@pytest.mark.parametrize(
+    ("kind", "above"), [("dnn_mso", "inversion.effectiveness"), ("adrc", "effectiveness")]
+)
+def test_a_constant_effectiveness_is_tuned_and_a_model_is_not(kind, above):
+    constant = f"controller.{above}.kind=constant"
+    free = Search(replace(REQUEST, controller=kind, sets=(*SETS, constant)))
+    knows = Search(replace(REQUEST, controller=kind))
+    assert free.space == knows.space | {f"{above}.b": B}
+    assert free.start[f"{above}.b"] == 1.0
 
 
 # The objective

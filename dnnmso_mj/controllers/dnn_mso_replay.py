@@ -1,23 +1,29 @@
 """The paper's controller with memory: it learns the plant, and does not merely adapt fast.
 
     X̂̇ = [q̇; f̂(X)] + B τ + K₂ e_a              (Eq. 5; τ is what acted, the upper rows are known)
-    u  = B₂⁻¹ (r₂ + Λ r₁) of f̂(X) + d̂          (Eq. 10), with the feed-forward d̂ = K₂ e_a
+    u  = B₂⁻¹ (r₂ + Λ r₁) of f̂(X) + d̂          (Eq. 10)
     W  ← Madam(W, ∂½‖f̂(X_i) − y_i‖²/∂W)         (Alg. 1), of this state and of remembered ones
 
-The labels are the observer's own implied dynamics, y = f̂(X) + K₂ e_a: since ė_a = f̃ − K₂ e_a, they
-are f seen through a first-order lag of 1/K₂. The learning rate follows how wrong the model is,
+Since ė_a = f̃ − K₂ e_a, z = K₂ e_a is f̃ through the lag L = K₂/(s + K₂). Three things follow.
 
-    η = η_min + (η₀ − η_min) min(1, ‖ē‖/c₀),    ē the low-passed K₂ e_a,
+*Labels.* The observer's implied dynamics, y = L f̂ + z, are L f exactly, however f̂ was changed by
+learning meanwhile; they are remembered at L X, the state through the same lag.
 
-so that it falls as the model gets better and rises when the plant changes, by no clock.
+*Feed-forward.* d̂ = z leaves f̃ − d̂ = (1 − L) f̃, and d̂ = 2z − L z, of second order, (1 − L)² f̃.
 
-A known delay D between a measurement and the torque that answers it is bridged by prediction: the
-model is integrated from the measured state over the torques that are on their way, and the law is
-applied to the state, and the reference, D ahead.
+*Learning rate.* It follows how wrong the model is, by no clock: with ē the low-passed z,
 
-What holds without any assumption on learning: s = ė + λe obeys ṡ = −K s + (f̃ − d̂) = −K s + ė_a, and
-e_a is f̃ through 1/(s + K₂). If ‖d f̃/dt‖ ≤ ρ, then ultimately ‖f̃ − d̂‖ ≤ ρ/K₂ and each
-|e_i| ≤ ρ/(K₂ K λ). See docs/dnn_mso_replay.md.
+    η = η_min + (η₀ − η_min) min(1, ‖ē‖/c₀),
+
+and that of replay follows the error of replay likewise, squared. The weights that are used are the
+mean over the last moments of those that learn, so that learning does not shake the arm.
+
+A known delay between a measurement and the torque that answers it is bridged by prediction: the law
+is applied to the state, and the reference, that the torque will meet.
+
+What holds without any assumption on learning, with B exact: s = ė + λe obeys ṡ = −K s + (f̃ − d̂).
+If ‖d²f̃/dt²‖ ≤ ρ, then ultimately ‖f̃ − d̂‖ ≤ ρ/K₂² and each |e_i| ≤ ρ/(K₂² K λ); with d̂ = z, and ρ
+a bound of ‖df̃/dt‖, |e_i| ≤ ρ/(K₂ K λ). See docs/dnn_mso_replay.md.
 """
 
 from __future__ import annotations

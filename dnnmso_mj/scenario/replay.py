@@ -54,7 +54,7 @@ class Replay(Strict):
     """Time between two states that are remembered (s)."""
     eta: LearningRate = 0.0003
     """Largest learning rate of remembered states."""
-    error: Positive = 0.35
+    error: Positive = 0.2
     """Their RMS error (rad/s²) from which on the rate is the largest; it falls with its square."""
 
 
@@ -87,7 +87,7 @@ class DnnMsoReplay(Strict):
     """DNN-MSO with experience replay."""
     inversion: Inversion = Inversion()
     """From the desired dynamics to a torque."""
-    K2: PositiveEach = (60.0,)
+    K2: PositiveEach = (70.0,)
     """Observer gain (1/s): one number, or one for each of the 2n states."""
     network: ModelNetwork = ModelNetwork()
     """The learned dynamics."""

@@ -36,7 +36,7 @@ class Tuned:
         out, storage: the file of the best trial, and of all trials.
         kept: trials that were there before.
         best: number of the best trial, from 0, the untuned controller.
-        parameters: key path -> value of the best trial.
+        parameters: key path -> value of the best trial; of a list, the factor.
         scenario: with the best controller in place.
         value, start_value: the objective of the best and of the first trial.
         test_value, test_start_value: the same on the test seeds; None without any.

@@ -23,8 +23,8 @@ from dnnmso_mj.sweep.plan import NUMBERS_DEPEND_ON, ordered_seeds, ready_point, 
 from dnnmso_mj.sweep.task import Row, Task
 from dnnmso_mj.tuning import TuneError
 from dnnmso_mj.tuning.objective import Objective
-from dnnmso_mj.tuning.spaces import SPACES, Range, Space
-from dnnmso_mj.tuning.study import Values
+from dnnmso_mj.tuning.spaces import Range, Space, space_of
+from dnnmso_mj.tuning.study import DIGITS, Values
 from dnnmso_mj.wording import clean, show
 
 
@@ -78,10 +78,18 @@ class Search:
         """The scenario of a trial."""
         if values == self.start:
             return self.scenario
-        tried = [f"controller.{path}={value!r}" for path, value in values.items()]
+        tried = [f"controller.{path}={self._meant(path, value)}" for path, value in values.items()]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of gains that the search tries and finds wanting
             return load_scenario(self._request.source, [*self._sets, *tried])
+
+    def _meant(self, path: str, value: float) -> str:
+        """What a tried number stands for: itself, or the starting numbers times it."""
+        if not self.space[path].factor:
+            return repr(value)
+        settings = self.scenario.model_dump(mode="json")["controller"]
+        first = lookup(settings, tuple(path.split(".")))
+        return repr([float(f"{value * one:.{DIGITS}g}") for one in first])
 
     def runs(self, pool: WorkerPool, values: Values, seeds: Iterable[int]) -> list[Row]:
         """One row a seed, by seed."""
@@ -128,17 +136,18 @@ def _space(scenario: Scenario, sets: Sequence[str]) -> tuple[Values, Space]:
     held = [item.path[1:] for item in parse_overrides(sets) if item.path[0] == "controller"]
     start: Values = {}
     space: Space = {}
-    for path, reach in SPACES[data["kind"]].items():
+    every = space_of(data)
+    for path, reach in every.items():
         keys = tuple(path.split("."))
         if any(of and keys[: len(of)] == of for of in held):
             continue
-        start[path] = _number(f"controller.{path}", lookup(data, keys), reach)
+        first = 1.0 if reach.factor else lookup(data, keys)
+        start[path] = _number(f"controller.{path}", first, reach)
         low, high = min(reach.low, start[path]), max(reach.high, start[path])
-        space[path] = Range(low, high, reach.log)
+        space[path] = reach._replace(low=low, high=high)
     if not space:
-        kind = data["kind"]
-        every = ", ".join(SPACES[kind])
-        raise TuneError(f"--set: holds all that is tuned of {kind}: {every}; allowed: fewer")
+        names = f"{data['kind']}: {', '.join(every)}"
+        raise TuneError(f"--set: holds all that is tuned of {names}; allowed: fewer")
     return start, space
 
 
