@@ -147,7 +147,7 @@ def test_learning_helps_and_its_sign_matters(make_scenario, two_link, kind):
     scenario = make_scenario(spec_of(kind), duration=2.0)
 
     def unlearn(before, after):
-        return before | {"x_hat": after["x_hat"]} if "x_hat" in after else before
+        return after | {name: before[name] for name in ("V", "W") if name in after}
 
     def turn_round(before, after):
         turned = {name: 2 * before[name] - after[name] for name in ("V", "W") if name in after}
