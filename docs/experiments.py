@@ -25,15 +25,13 @@ DT = 1e-3  # s, of every scenario here
 
 # Beside each kind, those that can do without a model of the inertia: name -> kind, what is set.
 CONSTANT = "controller.{}effectiveness.kind=constant"
+HALF = (
+    "controller.inversion.effectiveness={kind: constant, b: 0.5}"  # 1.0 is outside what it stands
+)
 VARIANTS = {
-    f"{kind}_constant": (kind, CONSTANT.format(above))
-    for kind, above in (
-        ("dnn_mso", "inversion."),
-        ("dnn_mso_replay", "inversion."),
-        ("adrc", ""),
-        ("sliding_mode", ""),
-        ("l1", ""),
-    )
+    "dnn_mso_constant": ("dnn_mso", CONSTANT.format("inversion.")),
+    "dnn_mso_replay_constant": ("dnn_mso_replay", HALF),
+    **{f"{kind}_constant": (kind, CONSTANT.format("")) for kind in ("adrc", "sliding_mode", "l1")},
 }
 AS_PUBLISHED = ("dnn_mso", "dnn_mso_replay")  # with their own settings, beside the tuned ones
 LEARNING = (
