@@ -285,8 +285,11 @@ def test_the_shipped_scenarios_are_as_hard_as_they_say():
     assert hard.imperfections.torque_limit == (120.0,)
     assert [(e.kind, e.at, e.mass) for e in hard.events] == [("payload", 20.0, 1.2)]
     assert late.imperfections.actuator_delay == 0.02
-    same = {"name", "description", "imperfections"}
-    assert hard.model_dump(exclude=same) == late.model_dump(exclude=same)
+    assert late.controller.known_delay.actuator == 0.02
+    rest = {"name", "description", "imperfections", "controller"}
+    assert hard.model_dump(exclude=rest) == late.model_dump(exclude=rest)
+    known = {"known_delay"}
+    assert hard.controller.model_dump(exclude=known) == late.controller.model_dump(exclude=known)
 
 
 @pytest.mark.parametrize(("name", "worst"), [("push", 1e-2), ("friction", 1e-2)])
