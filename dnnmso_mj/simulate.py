@@ -24,9 +24,10 @@ from dnnmso_mj.controllers import (
 )
 from dnnmso_mj.errors import NonFiniteError
 from dnnmso_mj.imperfections.actuators import build_actuators, start_actuators
-from dnnmso_mj.imperfections.loads import build_loads, start_loads
+from dnnmso_mj.imperfections.loads import Loads, build_loads, start_loads
 from dnnmso_mj.imperfections.sensors import SensorBank, sense
 from dnnmso_mj.imperfections.tip import Tip
+from dnnmso_mj.memory_recorder import LARGEST_BLOCK, MemoryRecorder
 from dnnmso_mj.plant import RK4, Mjcf, NominalModel, Plant
 from dnnmso_mj.reference import Reference
 from dnnmso_mj.scenario import Constant, Scenario
@@ -59,7 +60,6 @@ Progress = Callable[[int], None]
 
 HEAD_START_NS = 20_000_000  # from a paced run's beginning to its first tick
 BLOCK = 50  # ticks between two looks at the recorder, progress and interrupts
-LARGEST_BLOCK = 250  # where nothing waits for the rows
 CHUNK = 1000  # ticks of the reference sampled at once
 SNAPSHOT_PERIOD = 1.0  # s
 CHANGES = {
@@ -105,7 +105,7 @@ class Simulation:
         pace: Pace = AS_FAST_AS_CAN_BE,
         controller: Controller | None = None,
     ) -> None:
-        n = scenario.n_joints
+        n, dt = scenario.n_joints, scenario.dt
         self.scenario = scenario
         self.plant = Plant(scenario, mjcf)
         self.reference = Reference(scenario.reference, n)
@@ -114,26 +114,27 @@ class Simulation:
         self.layout = StepLayout(n, self.controller.n_layers)
         self._columns = {name: self.layout.slices[name].start for name in CHANGES}
         self._nominal = NominalModel(scenario, mjcf)
-        believed, law = effectiveness(scenario.controller), inversion(scenario.controller)
-        bounds = build_bounds(
-            law,
-            n,
-            scenario.dt,
-            first_order=self.plant.view.integrator != RK4,
-        )
-        self._tip = (
-            Tip(self.plant.model, scenario.plant.model) if tip_of_interest(scenario) else None
-        )
-        self._sensors = SensorBank(scenario.imperfections, n, scenario.dt, scenario.seed, CHUNK)
+        of_interest = tip_of_interest(scenario)
+        self._tip = Tip(self.plant.model, scenario.plant.model) if of_interest else None
+        self._sensors = SensorBank(scenario.imperfections, n, dt, scenario.seed, CHUNK)
         self._lookahead = lookahead(scenario.controller)
+        self.world = self._build_world(pace, build_loads(scenario, self.plant, self._tip))
+        self._plan = plan(scenario, self.world.loads, self._tip, self.world.inputs.frozen)
+        self._flags = dict.fromkeys(CHANGES, False)
+        self._first_state: dict[str, Array] | None = None
+
+    def _build_world(self, pace: Pace, loads: Loads) -> World:
+        scenario, n, dt = self.scenario, self.scenario.n_joints, self.scenario.dt
+        believed, law = effectiveness(scenario.controller), inversion(scenario.controller)
+        first_order = self.plant.view.integrator != RK4
         reference = np.zeros((CHUNK, 3 * n))
         x, x_ref, xd_ref, e_track, f_true, f_err = np.zeros((6, 2 * n))
-        self.world = World(
+        return World(
             plant=self.plant.view,
             sensors=self._sensors.view,
-            actuators=build_actuators(scenario.imperfections, n, scenario.dt),
-            loads=build_loads(scenario, self.plant, self._tip),
-            bounds=bounds,
+            actuators=build_actuators(scenario.imperfections, n, dt),
+            loads=loads,
+            bounds=build_bounds(law, n, dt, first_order=first_order),
             pace=pace,
             reference=reference,
             ahead=np.zeros_like(reference) if self._lookahead else reference,
@@ -154,11 +155,8 @@ class Simulation:
             counts=np.zeros(N_COUNTS, np.int64),
             late_ns=np.zeros(1, np.int64),
             timespec=np.zeros(2, np.int64),
-            dt=scenario.dt,
+            dt=dt,
         )
-        self._plan = plan(scenario, self.world.loads, self._tip, self.world.inputs.frozen)
-        self._flags = dict.fromkeys(CHANGES, False)
-        self._first_state: dict[str, Array] | None = None
 
     def run(self, recorder: Recorder, progress: Progress | None = None) -> RunInfo:
         """Run the scenario from its start to its end, or to its divergence.
@@ -338,38 +336,6 @@ class Simulation:
             for i in np.flatnonzero(flag != before):
                 level, what = ("warning", begins) if flag[i] else ("info", ends)
                 recorder.event(Event(float(rows[i, 0]), level, what))
-
-
-class MemoryRecorder:
-    """Keeps a run in memory and makes a `Trace` of it.
-
-    Args:
-        layout: of the rows.
-        n_ticks: how many rows there can be.
-    """
-
-    block = LARGEST_BLOCK
-
-    def __init__(self, layout: StepLayout, n_ticks: int) -> None:
-        self._layout = layout
-        self._rows = np.empty((n_ticks, layout.width))
-        self._count = 0
-        self._events: list[Event] = []
-
-    def append(self, rows: Array) -> None:
-        self._rows[self._count : self._count + len(rows)] = rows
-        self._count += len(rows)
-
-    def event(self, event: Event) -> None:
-        self._events.append(event)
-
-    def snapshot(self, name: str, t: float, arrays: dict[str, Array]) -> None:
-        """Snapshots are for logs; memory keeps none."""
-
-    def trace(self, scenario: Scenario, info: RunInfo) -> Trace:
-        """The columns recorded so far."""
-        columns = self._layout.columns(self._rows[: self._count])
-        return Trace(columns, scenario, info, tuple(self._events))
 
 
 def simulate(scenario: Scenario, mjcf: Mjcf | None = None, *, watch: bool = True) -> Trace:

@@ -24,12 +24,13 @@ from ruamel.yaml import YAML
 
 from dnnmso_mj.controllers.dnn_mso import DnnMsoController
 from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import BOUND_MARGIN, BOUND_ROUNDING, compute_metrics
 from dnnmso_mj.monitors import WATCH_EVERY
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import NoNetwork, Scenario
-from dnnmso_mj.simulate import MemoryRecorder, Simulation
+from dnnmso_mj.simulate import Simulation
 from dnnmso_mj.trace import Trace
 
 BASE = "paper"

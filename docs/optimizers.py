@@ -27,11 +27,12 @@ from dnnmso_mj.controllers import build_controller
 from dnnmso_mj.controllers.dnn_mso import DnnMsoController
 from dnnmso_mj.learner import KernelLearner
 from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import MemoryRecorder, Simulation
+from dnnmso_mj.simulate import Simulation
 from dnnmso_mj.trace import Trace
 
 Array = np.ndarray

@@ -17,7 +17,8 @@ from dnnmso_mj.controllers import MODEL_ALONE, MODEL_FROZEN, Inputs
 from dnnmso_mj.controllers.backstepping import BacksteppingController
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading import load_scenario
-from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
+from dnnmso_mj.memory_recorder import MemoryRecorder
+from dnnmso_mj.simulate import Simulation, simulate
 
 Array = np.ndarray
 LAG = 0.05

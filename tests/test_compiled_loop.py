@@ -17,9 +17,10 @@ import dnnmso_mj
 from dnnmso_mj.compile_loop import _whole
 from dnnmso_mj.controllers import compiled_ticks
 from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.plant import Plant
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
+from dnnmso_mj.simulate import Simulation, simulate
 
 CLOCKED = {"compute_us", "deadline_missed", "wake_late_us"}
 

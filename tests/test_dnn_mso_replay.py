@@ -15,8 +15,9 @@ from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.memory import CLOCK, SIZE
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.scenario import DnnMsoReplay, Scenario
-from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
+from dnnmso_mj.simulate import Simulation, simulate
 
 Array = np.ndarray
 KIND = "dnn_mso_replay"

@@ -12,9 +12,10 @@ from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.imperfections.tip import Tip
 from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf, Plant
-from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
+from dnnmso_mj.simulate import Simulation, simulate
 
 RNG = np.random.default_rng(0)
 STATES = RNG.normal(size=(50, 2, 2))

@@ -10,6 +10,7 @@ import pytest
 
 from dnnmso_mj.controllers import MODEL_FROZEN, Inputs, build_controller, compiled_ticks
 from dnnmso_mj.loading import controller_kinds
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.plots import run_figures
@@ -18,7 +19,7 @@ from dnnmso_mj.run import run_logged
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scenario.controller import inversion
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulate import MemoryRecorder, Simulation
+from dnnmso_mj.simulate import Simulation
 from dnnmso_mj.trace import Trace
 
 KINDS = pytest.mark.parametrize("kind", controller_kinds())

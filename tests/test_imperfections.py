@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import compute_metrics
-from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
+from dnnmso_mj.simulate import Simulation, simulate
 from dnnmso_mj.trace import Trace
 
 CLOCKED = {"compute_us", "deadline_missed", "wake_late_us"}

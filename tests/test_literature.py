@@ -11,7 +11,6 @@ from dnnmso_mj.loading import list_scenarios, load_scenario
 from dnnmso_mj.paths import find_model, scenarios_dir
 from dnnmso_mj.plant import Mjcf, NominalModel
 from dnnmso_mj.reference import Reference
-from dnnmso_mj.scenario import Imperfections
 from dnnmso_mj.simulate import simulate
 
 FILES = sorted((scenarios_dir() / "literature").glob("*.yaml"))
@@ -37,17 +36,13 @@ def lb_dnn(q, qd):
 
 ARMS = {"lewis": lewis, "lb_dnn": lb_dnn}
 F_D = np.array([5.3, 1.1])
-with_friction = pytest.mark.skipif(
-    "friction" not in Imperfections.model_fields, reason="no imperfections.friction yet"
-)
-every_arm = pytest.mark.parametrize("name", ["lewis", pytest.param("lb_dnn", marks=with_friction)])
+every_arm = pytest.mark.parametrize("name", ["lewis", "lb_dnn"])
 
 
 def test_each_file_has_its_formula_here():
     assert {file.stem for file in FILES} == set(ARMS)
 
 
-@with_friction  # the list has both
 @pytest.mark.parametrize("name", ARMS)
 def test_it_loads_by_name_without_a_warning_and_is_listed(name):
     with warnings.catch_warnings():
@@ -79,7 +74,6 @@ def test_lewis_follows_a_sine_and_a_cosine_from_rest_at_zero():
     assert (scenario.initial.q, scenario.initial.qd) == ((0.0, 0.0), (0.0,))
 
 
-@with_friction
 def test_lb_dnn_follows_the_published_trajectory():
     """With q̇_ref and q̈_ref as the code of the paper spells them out."""
     scenario = load_scenario("literature/lb_dnn")
@@ -93,7 +87,6 @@ def test_lb_dnn_follows_the_published_trajectory():
     assert np.allclose(qdd_ref.T, expected, atol=1e-13)
 
 
-@with_friction
 def test_lb_dnn_has_the_published_friction():
     """Without a torque, f_true = −M⁻¹ (V_m q̇ + F_d q̇) and nothing else moves the arm."""
     scenario = load_scenario("literature/lb_dnn", ["duration=0.2", "initial.qd=[1.0, -2.0]"])

@@ -9,12 +9,13 @@ from dnnmso_mj.controllers.dnn_mso import DnnMsoController
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.learner import KernelLearner, Learner, build_learner
 from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.network import Shape
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Adam, Madam, Network, Rule, Sgd, SignSgd
-from dnnmso_mj.simulate import MemoryRecorder, Simulation
+from dnnmso_mj.simulate import Simulation
 from dnnmso_mj.torch_learner import TorchLearner
 from dnnmso_mj.trace import Trace
 

@@ -11,12 +11,13 @@ from scipy.integrate import solve_ivp
 from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.inversion import build_inversion
 from dnnmso_mj.kernel import build_net, forward
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.network import initial_weights, network_shape
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.prediction import LONGEST, build_predictor, predict, report
 from dnnmso_mj.scenario import KnownDelay, Madam, Network
 from dnnmso_mj.scenario.inversion import Inversion
-from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
+from dnnmso_mj.simulate import Simulation, simulate
 
 Array = np.ndarray
 ARM = TwoLink((1.0, 2.3), (1.0, 1.0))

@@ -15,11 +15,12 @@ import pytest
 
 from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.realtime import left_in_peace, real_time_pace
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
+from dnnmso_mj.simulate import Simulation, simulate
 from dnnmso_mj.timing import timing
 from dnnmso_mj.trace import Trace
 

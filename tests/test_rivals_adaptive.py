@@ -13,11 +13,12 @@ from dnnmso_mj import history_stack as stacks
 from dnnmso_mj.controllers import Inputs
 from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import ScenarioError
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.plant import Mjcf, NominalModel
 from dnnmso_mj.reference import Reference
 from dnnmso_mj.regressor import drift, momentum, momentum_loss, regressor
 from dnnmso_mj.scenario.adaptive import N_PARAMETERS
-from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
+from dnnmso_mj.simulate import Simulation, simulate
 
 KINDS = ("slotine_li", "concurrent_learning")
 LINKS = ("point_mass", "rod")

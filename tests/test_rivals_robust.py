@@ -10,8 +10,9 @@ from dnnmso_mj.controllers.adrc import observer_gain
 from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import compute_metrics
-from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
+from dnnmso_mj.simulate import Simulation, simulate
 from tests.test_compiled_loop import CLOCKED, Wrapped
 from tests.test_simulate import chain
 

@@ -10,10 +10,11 @@ import numpy as np
 from dnnmso_mj.controllers import Inputs
 from dnnmso_mj.learner import build_learner
 from dnnmso_mj.loading import controller_kinds, load_scenario
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Madam, Network
-from dnnmso_mj.simulate import MemoryRecorder, Simulation, simulate
+from dnnmso_mj.simulate import Simulation, simulate
 
 DOUBLE = "controller.network.precision=float64"
 

@@ -15,9 +15,10 @@ from dnnmso_mj.audit.knowledge import knowledge
 from dnnmso_mj.audit.portrait import Portrait, map_slices
 from dnnmso_mj.audit.region import Region, region_of
 from dnnmso_mj.audit.unseen import SETTLING, Unseen
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import MemoryRecorder, Simulation
+from dnnmso_mj.simulate import Simulation
 from dnnmso_mj.trace import Trace
 
 Array = np.ndarray

@@ -92,9 +92,8 @@ def _print_times(found: Audit, times: Sequence[float]) -> None:
     from dnnmso_mj.audit.summary import MEASURES
 
     seeds = len(found.plan.seeds)
-    table = Table(
-        title=f"{found.plan.name}: weights frozen, {seeds} seeds", box=None, pad_edge=False
-    )
+    of = "1 seed" if seeds == 1 else f"{seeds} seeds"
+    table = Table(title=f"{found.plan.name}: weights frozen, {of}", box=None, pad_edge=False)
     table.add_column("median, 95 % interval", no_wrap=True)
     for time in times:
         table.add_column(f"at {time:g} s", justify="right", no_wrap=True)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,7 +23,7 @@ from dnnmso_mj.cli.shared import (
     print_table,
     working,
 )
-from dnnmso_mj.cli.watching import how_to_go_on, terminated_like_ctrl_c, watching
+from dnnmso_mj.cli.watching import run_watched
 
 if TYPE_CHECKING:
     from dnnmso_mj.comparison.pairing import Pairing
@@ -70,19 +68,17 @@ def compare(
     with working("checking every controller"):
         plan = plan_comparison(scenario, names, numbers, overrides or ())
     out = out or default_out(plan)
-    engine, command = LocalEngine(jobs), shlex.join(["dnnmso", *sys.argv[1:]])
-    with watching(plan.points[0].scenario.name) as watcher:
-        try:
-            with terminated_like_ctrl_c():
-                result = run_sweep(
-                    plan, out, engine, resume=resume, force=force, watcher=watcher, command=command
-                )
-        except KeyboardInterrupt as stop:
-            watcher.stop()
-            raise KeyboardInterrupt(how_to_go_on(watcher.done, plan.n_runs, out)) from stop
+    engine, name = LocalEngine(jobs), plan.points[0].scenario.name
+    result = run_watched(
+        name,
+        plan.n_runs,
+        out,
+        lambda watcher, command: run_sweep(
+            plan, out, engine, resume=resume, force=force, watcher=watcher, command=command
+        ),
+    )
     with working("summing up"):
         found = summarise(result.table)
-    name = plan.points[0].scenario.name
     if as_json:
         print(json.dumps(_document(found, result, name, names[0]), allow_nan=False))
     else:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,7 +21,7 @@ from dnnmso_mj.cli.shared import (
     print_table,
     working,
 )
-from dnnmso_mj.cli.watching import how_to_go_on, terminated_like_ctrl_c, watching
+from dnnmso_mj.cli.watching import run_watched
 
 if TYPE_CHECKING:
     from dnnmso_mj.margins.cards import Margin, Ranking
@@ -71,16 +69,15 @@ def margins(
     with working("checking every controller and row"):
         plan = plan_margins(scenario, names, asked, numbers, overrides or (), limit)
     out = out or default_out(plan)
-    command = shlex.join(["dnnmso", *sys.argv[1:]])
-    with watching(plan.points[0].scenario.name, ("none", "failed")) as watcher:
-        try:
-            with terminated_like_ctrl_c():
-                result = run_margins(
-                    plan, out, jobs, resume=resume, force=force, watcher=watcher, command=command
-                )
-        except KeyboardInterrupt as stop:
-            watcher.stop()
-            raise KeyboardInterrupt(how_to_go_on(watcher.done, plan.n_runs, out)) from stop
+    result = run_watched(
+        plan.points[0].scenario.name,
+        plan.n_runs,
+        out,
+        lambda watcher, command: run_margins(
+            plan, out, jobs, resume=resume, force=force, watcher=watcher, command=command
+        ),
+        bad=("none", "failed"),
+    )
     lines = margins_of(result.table, result.provenance)
     ranking = rank(lines, result.provenance)
     if as_json:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,7 +22,7 @@ from dnnmso_mj.cli.shared import (
     print_table,
     working,
 )
-from dnnmso_mj.cli.watching import how_to_go_on, terminated_like_ctrl_c, watching
+from dnnmso_mj.cli.watching import run_watched
 
 if TYPE_CHECKING:
     from dnnmso_mj.sweep.plan import Plan
@@ -64,16 +63,14 @@ def sweep(
     with working("checking every point"):
         plan = plan_sweep(scenario, parse_seeds(seeds), overrides or (), grid or ())
     out = out or default_out(plan)
-    command = shlex.join(["dnnmso", *sys.argv[1:]])
-    with watching(plan.points[0].scenario.name) as watcher:
-        try:
-            with terminated_like_ctrl_c():
-                result = run_sweep(
-                    plan, out, runner, resume=resume, force=force, watcher=watcher, command=command
-                )
-        except KeyboardInterrupt as stop:
-            watcher.stop()
-            raise KeyboardInterrupt(how_to_go_on(watcher.done, plan.n_runs, out)) from stop
+    result = run_watched(
+        plan.points[0].scenario.name,
+        plan.n_runs,
+        out,
+        lambda watcher, command: run_sweep(
+            plan, out, runner, resume=resume, force=force, watcher=watcher, command=command
+        ),
+    )
     with working("summing up"):
         points = summarise(result.table, plan)
     if as_json:

@@ -6,10 +6,10 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from dnnmso_mj.cli.shared import near
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from dnnmso_mj.sweep.task import Row
+
+Result = TypeVar("Result")
 
 LINE_PERIOD = 30.0  # s between lines of progress where there is no terminal
 
@@ -99,6 +101,31 @@ def terminated_like_ctrl_c() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def run_watched(
+    name: str,
+    total: int,
+    out: Path,
+    run: Callable[[Watch, str], Result],
+    bad: tuple[str, ...] = ("diverged", "failed"),
+) -> Result:
+    """Do what makes rows; Ctrl-C or SIGTERM says what is kept, and how to go on.
+
+    Args:
+        name: of what is run.
+        total: rows that there will be.
+        out: the table.
+        run: takes the watcher, and the command as a person would type it.
+        bad: statuses of rows that are counted as gone wrong.
+    """
+    with watching(name, bad) as watcher:
+        try:
+            with terminated_like_ctrl_c():
+                return run(watcher, shlex.join(["dnnmso", *sys.argv[1:]]))
+        except KeyboardInterrupt as stop:
+            watcher.stop()
+            raise KeyboardInterrupt(how_to_go_on(watcher.done, total, out)) from stop
 
 
 def how_to_go_on(done: int, total: int, out: Path, what: str = "rows") -> str:

@@ -31,7 +31,8 @@ import numpy as np
 
 from dnnmso_mj.compiling import compiled, inner
 from dnnmso_mj.controllers import Command, CompiledTicks, Inputs
-from dnnmso_mj.controllers.slotine_li import Law, adapt, build_command, build_law, show, track
+from dnnmso_mj.controllers.measured import empty_command
+from dnnmso_mj.controllers.slotine_li import Law, adapt, build_law, show, track
 from dnnmso_mj.history_stack import EMPTY, HistoryStack, build_stack, learn, offer, refresh
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.regressor import drift, momentum, momentum_loss, refuse_other_arms
@@ -95,7 +96,7 @@ class ConcurrentLearningController:
             periods=np.array([-1]),
             length=length,
         )
-        self._parts = Parts(law, window, stack, build_command())
+        self._parts = Parts(law, window, stack, empty_command(2))
         self.ticks = CompiledTicks(run_ticks, self._parts, ConcurrentLearningController.update)
 
     def reset(self, x: Array) -> None:

@@ -7,7 +7,8 @@
 Since ė_a = f̃ − K₂ e_a, z = K₂ e_a is f̃ through the lag L = K₂/(s + K₂). Three things follow.
 
 *Labels.* The observer's implied dynamics, y = L f̂ + z, are L f exactly, however f̂ was changed by
-learning meanwhile; they are remembered at L X, the state through the same lag.
+learning meanwhile; they are remembered at L X, the state through the same lag, unless z is just
+turning (‖z − ē‖ ≥ c₀), where the lag falsifies them.
 
 *Feed-forward.* d̂ = z leaves f̃ − d̂ = (1 − L) f̃, and d̂ = 2z − L z, of second order, (1 − L)² f̃.
 
@@ -93,9 +94,9 @@ class Law(NamedTuple):
     ticks: Array  # (1,) int64 done so far
     decay: float  # of the low pass in a tick
     error: float  # c₀, rad/s²
-    eta_0: float
-    eta_min: float
-    eta_replay: float
+    eta_0: float  # η of an error from c₀ on
+    eta_min: float  # η of none
+    eta_replay: float  # that of replay, from replay_error on
     replay_error: float  # rad/s²
     replay_sq: Array  # (1,) low-passed ‖f̂(X_i) − y_i‖² of what was replayed
     replay_share: float  # of one sample in it
@@ -103,7 +104,7 @@ class Law(NamedTuple):
     samples: int  # replayed in a tick
     every: int  # ticks between two states that are remembered
     feed_forward: bool
-    lead: float
+    lead: float  # 1 for the second order: how much of z − L z is added to z
 
 
 class Parts(NamedTuple):
@@ -114,6 +115,46 @@ class Parts(NamedTuple):
     net: Net  # that learns
     mean: Net  # with the mean of its weights over the last time, which is used
     watch: Watch
+
+
+def build_law(spec: DnnMsoReplay, n_joints: int, dt: float, nominal: NominalModel) -> Law:
+    """The law of a scenario, with an empty memory; arguments as of the controller."""
+    n, replay, rate = n_joints, spec.replay, spec.rate
+    acted, z, d_hat, z_lagged, low_passed, f_lagged, label, free = np.zeros((8, n))
+    f_used, x_lagged = np.zeros((2, 2 * n))
+    spreads = (replay.position_spread, replay.velocity_spread)
+    return Law(
+        inversion=build_inversion(spec.inversion, n, nominal.view),
+        observer=build_observer(Observer(K2=spec.K2), 2 * n, dt),
+        memory=build_memory(replay.capacity, n, replay.spacing, *spreads),
+        predictor=build_predictor(spec.known_delay, n, dt),
+        f_used=f_used,
+        acted=acted,
+        z=z,
+        d_hat=d_hat,
+        z_lagged=z_lagged,
+        low_passed=low_passed,
+        f_lagged=f_lagged,
+        x_lagged=x_lagged,
+        label=label,
+        M=np.eye(n),
+        free=free,
+        L=np.zeros((n, n)),
+        ticks=np.zeros(1, np.int64),
+        decay=math.exp(-dt / rate.low_pass),
+        error=rate.error,
+        eta_0=spec.madam.eta,
+        eta_min=rate.eta_min,
+        eta_replay=replay.eta,
+        replay_error=replay.error,
+        replay_sq=np.zeros(1),
+        replay_share=-math.expm1(-dt / REPLAY_TIME / max(1, replay.samples)),
+        average=-math.expm1(-dt / rate.average),
+        samples=replay.samples,
+        every=max(1, round(replay.every / dt)),
+        feed_forward=spec.feed_forward > 0,
+        lead=1.0 if spec.feed_forward == 2 else 0.0,
+    )
 
 
 class DnnMsoReplayController:
@@ -138,59 +179,21 @@ class DnnMsoReplayController:
         *,
         watch: bool = True,
     ) -> None:
-        n, replay, rate = n_joints, spec.replay, spec.rate
+        n = n_joints
         self._nominal = nominal  # keeps alive what compiled code knows by address
         network = spec.network.as_network()
         shape = network_shape(network, 2 * n, n)
         weights = initial_weights(shape, network, np.random.default_rng(seed))
         weights = weights.astype(network.precision)
-        learner = KernelLearner(shape, weights, spec.madam, watch=watch)
-        self.learner = learner
-        self.n_layers = learner.shape.n_layers
-        inversion = build_inversion(spec.inversion, n, nominal.view)
-        observer = build_observer(Observer(K2=spec.K2), 2 * n, dt)
-        self._command = command_of(inversion, observer.e_obs, learner.monitors)
-        self._law = Law(
-            inversion=inversion,
-            observer=observer,
-            memory=build_memory(
-                replay.capacity,
-                n,
-                replay.spacing,
-                replay.position_spread,
-                replay.velocity_spread,
-            ),
-            predictor=build_predictor(spec.known_delay, n, dt),
-            f_used=np.zeros(2 * n),
-            acted=np.zeros(n),
-            z=np.zeros(n),
-            d_hat=np.zeros(n),
-            z_lagged=np.zeros(n),
-            low_passed=np.zeros(n),
-            f_lagged=np.zeros(n),
-            x_lagged=np.zeros(2 * n),
-            label=np.zeros(n),
-            M=np.eye(n),
-            free=np.zeros(n),
-            L=np.zeros((n, n)),
-            ticks=np.zeros(1, np.int64),
-            decay=math.exp(-dt / rate.low_pass),
-            error=rate.error,
-            eta_0=spec.madam.eta,
-            eta_min=rate.eta_min,
-            eta_replay=replay.eta,
-            replay_error=replay.error,
-            replay_sq=np.zeros(1),
-            replay_share=-math.expm1(-dt / REPLAY_TIME / max(1, replay.samples)),
-            average=-math.expm1(-dt / rate.average),
-            samples=replay.samples,
-            every=max(1, round(replay.every / dt)),
-            feed_forward=spec.feed_forward > 0,
-            lead=1.0 if spec.feed_forward == 2 else 0.0,
+        self.learner = KernelLearner(shape, weights, spec.madam, watch=watch)
+        self.n_layers = shape.n_layers
+        self._law = build_law(spec, n, dt, nominal)
+        self._command = command_of(
+            self._law.inversion, self._law.observer.e_obs, self.learner.monitors
         )
-        net = learner.net
+        net = self.learner.net
         self._mean = net._replace(w=net.w.copy(), acts=np.zeros_like(net.acts))
-        parts = Parts(self._law, self._command, net, self._mean, learner.watch)
+        parts = Parts(self._law, self._command, net, self._mean, self.learner.watch)
         self.ticks = CompiledTicks(run_ticks, parts, DnnMsoReplayController.update)
 
     def reset(self, x: Array) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from dnnmso_mj.compiling import compiled, copy, inner
 from dnnmso_mj.controllers import Command, CompiledTicks, Inputs
-from dnnmso_mj.monitors import Monitors
+from dnnmso_mj.controllers.measured import empty_command
 from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.regressor import drift, refuse_other_arms, regressor
 from dnnmso_mj.scenario import ConcurrentLearning, SlotineLi, expand
@@ -71,12 +71,6 @@ def build_law(spec: SlotineLi | ConcurrentLearning, dt: float) -> Law:
     )
 
 
-def build_command() -> Command:
-    """A command of a controller without B, observer and network, for two joints."""
-    Bu, x_hat, f_hat, e_obs = np.zeros((4, 4))
-    return Command(np.zeros(2), Bu, x_hat, f_hat, e_obs, Monitors.zeros(0))
-
-
 class SlotineLiController:
     """Passivity-based adaptive control of a two-link arm.
 
@@ -93,7 +87,7 @@ class SlotineLiController:
 
     def __init__(self, spec: SlotineLi, dt: float, nominal: NominalModel) -> None:
         refuse_other_arms(nominal, spec.kind)
-        self._parts = Parts(build_law(spec, dt), build_command())
+        self._parts = Parts(build_law(spec, dt), empty_command(2))
         self.ticks = CompiledTicks(run_ticks, self._parts, SlotineLiController.update)
 
     def reset(self, x: Array) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,14 +11,14 @@ from typing import Any
 import pyarrow as pa
 
 from dnnmso_mj.margins.plan import MarginPlan, model_free
-from dnnmso_mj.margins.rows import ROWS, MarginError
+from dnnmso_mj.margins.rows import ROWS
 from dnnmso_mj.margins.search import HALVINGS, PRECISION, PROBES_BELOW
 from dnnmso_mj.paths import logs_dir
 from dnnmso_mj.provenance import software_versions
 from dnnmso_mj.sweep.journal import Journal
 from dnnmso_mj.sweep.local import LocalEngine
 from dnnmso_mj.sweep.plan import seeds_text
-from dnnmso_mj.sweep.run import Watcher
+from dnnmso_mj.sweep.run import Watcher, complete, refuse_both
 from dnnmso_mj.sweep.table import Kind, write_table
 
 METADATA_KEY = b"dnnmso_margins"
@@ -91,29 +90,19 @@ def run_margins(
         command: what a person would type; kept in the table's metadata.
 
     Raises:
-        MarginError: rows are missing.
-        SweepError: `out` is taken or cannot be written, what is there is of other margins, or the
-            workers cannot be started.
+        SweepError: `out` is taken or cannot be written, what is there is of other margins, rows
+            are missing, or the workers cannot be started.
     """
+    refuse_both(resume, force)
     out, engine = out or default_out(plan), LocalEngine(jobs)
     started = time.perf_counter()
     with Journal(out, plan, MARGINS, resume=resume, force=force) as journal:
         kept = journal.n_done
-        if watcher is not None:
-            watcher.begin(plan.n_runs, kept)
-        if kept < plan.n_runs:
-            with closing(engine.rows(plan.tasks(journal.done))) as rows:
-                for row in rows:
-                    journal.append(row)
-                    if watcher is not None:
-                        watcher.row(row)
-        rows_kept = journal.rows()
-        if not len(rows_kept) == journal.n_done == plan.n_runs:
-            raise MarginError(
-                f"{out}: {len(rows_kept)} rows; allowed: {plan.n_runs}; --resume makes the others"
-            )
+        rows, _ = complete(
+            journal, plan.n_runs, lambda: engine.rows(plan.tasks(journal.done)), watcher
+        )
         provenance = _provenance(plan, command)
-        table = _finished(rows_kept, plan, provenance)
+        table = _finished(rows, plan, provenance)
         write_table(table, out)
         journal.remove()
     return MarginResult(out, table, provenance, kept, time.perf_counter() - started, engine.jobs)

@@ -78,7 +78,7 @@ class Journal:
     ) -> None:
         if out.is_dir():
             raise SweepError(f"{out}: a folder; allowed: a file, as in sweep.parquet")
-        self._out, self._plan, self._kind = out, plan, kind
+        self.out, self._plan, self._kind = out, plan, kind
         self._path = journal_path(out)
         self._synced = time.monotonic()
         self.done: list[set[int]] = [set() for _ in plan.points]
@@ -159,7 +159,7 @@ class Journal:
             return
         with _writing(self._path):
             os.ftruncate(self._file, 0)
-        finished = resume and self._out.exists()
+        finished = resume and self.out.exists()
         rows = self._finished_rows() if finished else self._kind.rows.empty_table()
         self._write(json.dumps(self._plan.definition()))
         self._first_row = self._size()
@@ -188,7 +188,7 @@ class Journal:
 
     def _finished_rows(self) -> pa.Table:
         """The rows of a finished table, if it is of this sweep."""
-        table, provenance = read_table(self._out, self._kind)
+        table, provenance = read_table(self.out, self._kind)
         self._check_same(provenance.get("definition"))
         rows = unfinished_rows(table, len(self._plan.points), self._kind)
         self._check_asked(rows)
@@ -204,7 +204,7 @@ class Journal:
             more = [f"… and {len(found) - LISTED} more"] if len(found) > LISTED else []
             listed = "\n  ".join(found[:LISTED] + more)
             raise SweepError(
-                f"{self._out}: --resume: what is there is of another sweep:\n  {listed}\n"
+                f"{self.out}: --resume: what is there is of another sweep:\n  {listed}\n"
                 "allowed: the same scenario, grid and software; or --force, or another --out"
             )
 
@@ -212,7 +212,7 @@ class Journal:
         extra = sorted(set(rows["seed"].to_pylist()) - set(self._plan.seeds))
         if extra:
             raise SweepError(
-                f"{self._out}: --resume: holds seeds that are not asked for: "
+                f"{self.out}: --resume: holds seeds that are not asked for: "
                 f"{show(seeds_text(extra))[1:-1]}; allowed: --seeds with these and more"
             )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,32 +124,65 @@ def run_sweep(
         SweepError: `out` is taken or cannot be written, what is there is of another sweep, or the
             workers cannot be started.
     """
-    if resume and force:
-        raise SweepError("--resume and --force: one goes on, one starts anew; allowed: one of them")
+    refuse_both(resume, force)
     out, engine = out or default_out(plan), engine or LocalEngine()
-    started, ticks = time.perf_counter(), 0
+    started = time.perf_counter()
     with Journal(out, plan, resume=resume, force=force) as journal:
         kept = journal.n_done
-        if watcher is not None:
-            watcher.begin(plan.n_runs, kept)
-        if kept < plan.n_runs:
-            with closing(engine.rows(plan.tasks(journal.done))) as rows:
-                for row in rows:
-                    journal.append(row)
-                    ticks += row["ticks"]
-                    if watcher is not None:
-                        watcher.row(row)
-        rows_kept = journal.rows()
-        if not len(rows_kept) == journal.n_done == plan.n_runs:
-            raise SweepError(
-                f"{out}: {len(rows_kept)} rows of {journal.n_done} runs; allowed: {plan.n_runs}, "
-                "one a run; --resume makes what is missing"
-            )
-        table = finished_table(rows_kept, plan, _provenance(plan, engine, command))
+        rows, ticks = complete(
+            journal, plan.n_runs, lambda: engine.rows(plan.tasks(journal.done)), watcher
+        )
+        table = finished_table(rows, plan, _provenance(plan, engine, command))
         write_table(table, out)
         journal.remove()
     wall_s = time.perf_counter() - started
     return SweepResult(out, table, kept, ticks, wall_s, engine.jobs)
+
+
+def refuse_both(resume: bool, force: bool) -> None:
+    """Refuse to go on and to start anew at once.
+
+    Raises:
+        SweepError: both are asked for.
+    """
+    if resume and force:
+        raise SweepError("--resume and --force: one goes on, one starts anew; allowed: one of them")
+
+
+def complete(
+    journal: Journal, n_runs: int, make: Callable[[], Generator[Row]], watcher: Watcher | None
+) -> tuple[pa.Table, int]:
+    """Add to a journal the rows that it lacks.
+
+    Args:
+        journal: of finished rows.
+        n_runs: how many there are to be.
+        make: starts to yield those that are missing.
+        watcher: told of every row.
+
+    Returns:
+        All rows, and how many ticks the new ones took.
+
+    Raises:
+        SweepError: rows are missing at the end.
+    """
+    ticks = 0
+    if watcher is not None:
+        watcher.begin(n_runs, journal.n_done)
+    if journal.n_done < n_runs:
+        with closing(make()) as rows:
+            for row in rows:
+                journal.append(row)
+                ticks += row["ticks"]
+                if watcher is not None:
+                    watcher.row(row)
+    table = journal.rows()
+    if not len(table) == journal.n_done == n_runs:
+        raise SweepError(
+            f"{journal.out}: {len(table)} rows of {journal.n_done} runs; allowed: {n_runs}, "
+            "one a run; --resume makes what is missing"
+        )
+    return table, ticks
 
 
 def _provenance(plan: Plan, engine: Engine, command: str) -> dict[str, Any]:

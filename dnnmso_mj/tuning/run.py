@@ -13,7 +13,7 @@ from dnnmso_mj.sweep.local import LocalEngine, WorkerPool
 from dnnmso_mj.sweep.plan import check_keys, seeds_text
 from dnnmso_mj.tuning import TuneError, TuneInterrupted
 from dnnmso_mj.tuning.search import Request, Search
-from dnnmso_mj.tuning.study import Study, Values
+from dnnmso_mj.tuning.study import Study, Values, import_optuna
 from dnnmso_mj.tuning.winner import check_out, write_tuned
 from dnnmso_mj.wording import show
 
@@ -90,6 +90,7 @@ def tune(
         TuneInterrupted: Ctrl-C.
     """
     _check(request, resume, force)
+    import_optuna()  # before seconds of compiling
     check_out(out, replace=resume or force)
     search = Search(request)
     storage, name = storage or default_storage(out), f"{request.controller} on {search.name}"
