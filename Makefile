@@ -15,7 +15,7 @@ help:
 	@echo "make check    format, lint and type checks"
 	@echo "make format   format and fix what can be fixed"
 	@echo "make figures  draw the pictures of the README and docs anew"
-	@echo "make experiments  tune, compare and audit all that docs/findings.md quotes (about 45 minutes)"
+	@echo "make experiments  tune, compare and audit all that docs/findings.md quotes; long"
 	@echo "make schema   write scenarios/scenario.schema.json anew"
 	@echo "make build    build wheel and sdist into dist/"
 	@echo "make clean    remove the environment and all caches"
