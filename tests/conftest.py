@@ -28,7 +28,12 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def compiled_loop() -> None:
-    """Compile once, so that no test of a command line sees the notice that it does."""
+    """Compile once, so that no test of a command line sees the notice that it does.
+
+    DNNMSO_SKIP_WARM_UP leaves it out, for a few tests of which each compiles what it needs.
+    """
+    if os.environ.get("DNNMSO_SKIP_WARM_UP"):
+        return
     subprocess.run([sys.executable, ROOT / "tests" / "warm_up.py"], check=True)
 
 
