@@ -1,14 +1,35 @@
-"""Mathematics without scripts: what stands between dollars becomes MathML, which browsers draw."""
+"""Mathematics without scripts: what stands between dollars becomes MathML, which browsers draw.
+
+The font, STIX Two Math (OFL), comes out of the package ziamath, so that a formula looks the same on
+every machine.
+"""
 
 from __future__ import annotations
 
 import html
 import re
+from importlib.resources import files as resources
+from itertools import pairwise
 from typing import Any
+from xml.etree import ElementTree
 
 from latex2mathml.converter import convert
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
 
 FORMULA = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
+NUMBER = re.compile(r"\\tag\{(.*?)\}")
+XMLNS = ' xmlns="http://www.w3.org/1998/Math/MathML"'
+CLOSING = {")", "]", "‖", "|"}
+ACCENTS = {"^": "ˆ", "~": "˜", "˙": "˙", "¨": "¨", "¯": "¯"}
+FONT = "STIXTwoMath-Regular.ttf"
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the font, beside the style sheet that names it."""
+    font = resources("ziamath").joinpath("fonts", FONT).read_bytes()
+    files.append(File.generated(config, f"style/{FONT}", content=font))
+    return files
 
 
 def on_page_content(content: str, **_: Any) -> str:
@@ -19,7 +40,28 @@ def on_page_content(content: str, **_: Any) -> str:
 def _draw(formula: re.Match[str]) -> str:
     tag, text = formula.groups()
     tex = html.unescape(text).strip()[2:-2]  # without \( and \), or \[ and \]
-    drawn = convert(tex, display="block" if tag == "div" else "inline")
+    number = NUMBER.search(tex)
+    drawn = _mended(convert(NUMBER.sub("", tex), display="block" if tag == "div" else "inline"))
     if "\\" in drawn:
         raise ValueError(f"no MathML for a part of {tex!r}: {drawn}")
-    return f'<{tag} class="formula">{drawn}</{tag}>'
+    beside = f'<span class="number">({number[1]})</span>' if number else ""
+    return f'<{tag} class="formula">{drawn}{beside}</{tag}>'
+
+
+def _mended(mathml: str) -> str:
+    """What the converter leaves to better browsers.
+
+    Accents as accents, close to their letters, and a minus that follows a sign as the sign of what
+    comes after it.
+    """
+    root = ElementTree.fromstring(mathml.replace(XMLNS, ""))  # HTML has no namespaces
+    for over in root.iter("mover"):
+        accent = over[1]
+        if accent.text in ACCENTS:
+            over.set("accent", "true")
+            accent.text, accent.attrib = ACCENTS[accent.text], {"stretchy": "false"}
+    for row in root.iter():
+        for before, sign in pairwise(row):
+            if sign.text == "−" and before.tag == "mo" and before.text not in CLOSING:
+                sign.set("form", "prefix")
+    return ElementTree.tostring(root, encoding="unicode")
