@@ -1,91 +1,138 @@
-"""README and docs: their commands run, their links lead somewhere, their Python works."""
+"""README and docs: their commands run, their links lead somewhere, their Python works.
+
+Commands run in this process, each once, in the order of the pages, in one folder with the logs and
+files that the pages speak of; simulations take coarser steps. That `dnnmso` is a program is test_cli's.
+"""
 
 from __future__ import annotations
 
 import re
 import shlex
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from vulkan import needs_vulkan
+from typer.testing import CliRunner
+
+from dnnmso_mj.cli import app
+from tests.vulkan import needs_vulkan
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-BIN = Path(sys.executable).parent
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+TEXTS = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in PAGES}
+
+# What makes a command cheap without making it another one: a fifth of the ticks, fewer trials.
+COARSE = ["--set", "dt=0.005"]
+CHEAPER = {
+    "run": COARSE,
+    "sweep": COARSE,
+    "compare": COARSE,
+    "margins": COARSE,
+    "tune": [*COARSE, "--trials", "3"],
+    "audit": COARSE,
+    "check": ["--states", "100"],
+}
+BY_THE_CLOCK = ["--set", "duration=1.2"]
 
 
-def blocks(page: Path, language: str) -> list[str]:
-    pattern = rf"^```{language}\n(.*?)^```"
-    return re.findall(pattern, page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+def blocks(text: str, language: str) -> list[str]:
+    """The fenced blocks of a language, without what stands beside its name."""
+    return re.findall(rf"^```{language}\b[^\n]*\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
-def commands(page: Path, program: str) -> list[list[str]]:
-    lines = [line for block in blocks(page, "sh") for line in block.splitlines()]
+def commands(program: str, text: str) -> list[str]:
+    lines = [line for block in blocks(text, "sh") for line in block.splitlines()]
     split = [shlex.split(line, comments=True) for line in lines]
-    return [words for words in split if words and words[0] == program]
+    return [shlex.join(words) for words in split if words and words[0] == program]
+
+
+def all_commands(program: str) -> list[str]:
+    """Each command of all pages once, in their order."""
+    return list(dict.fromkeys(line for text in TEXTS.values() for line in commands(program, text)))
+
+
+def is_tried_elsewhere(command: str) -> bool:
+    """Whether it waits for a person, as test_viewer.py tries it, or is all that test_bench.py does."""
+    words = shlex.split(command)
+    opens = words[1] == "replay" and not {"--save", "--screenshot"} & set(words)
+    return opens or words[1] == "bench" or bool({"--serve", "--view"} & set(words))
+
+
+def draws(command: str) -> bool:
+    return "--screenshot" in command
 
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory) -> Path:
-    """A folder with the logs that the pages speak of."""
+    """A folder with the logs that the pages speak of, and the files that they have one write."""
     folder = tmp_path_factory.mktemp("workplace")
-    for name in ("paper", "paper_no_network"):
-        short = [BIN / "dnnmso", "run", name, "--set", "duration=0.2", "--no-plot"]
-        subprocess.run(short, cwd=folder, check=True, capture_output=True, timeout=120)
+    for text in TEXTS.values():
+        for name, content in re.findall(
+            r'^```yaml title="([\w.]+)"\n(.*?)^```', text, re.MULTILINE | re.DOTALL
+        ):
+            (folder / name).write_text(content, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for name in ("paper", "paper_no_network"):
+            invoke(f"dnnmso run {name} --no-plot")
     return folder
 
 
-def run(words: list[str], workplace: Path) -> None:
-    if "--at" in words:
-        words[words.index("--at") + 1] = "0.1"  # the logs here are short
-    command = [BIN / words[0], *words[1:]]
-    done = subprocess.run(
-        command, cwd=workplace, capture_output=True, text=True, check=False, timeout=120
-    )
-    assert done.returncode == 0, (words, done.stderr)
+def invoke(command: str) -> None:
+    """Run a command as it stands, but for what makes it cheaper."""
+    name, *words = shlex.split(command)[1:]
+    cheaper = BY_THE_CLOCK if "--real-time" in words else CHEAPER.get(name, [])
+    done = CliRunner().invoke(app, [name, *words, *cheaper], catch_exceptions=False)
+    assert done.exit_code == 0, (command, done.output)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_dnnmso_command_on_the_page_runs(page, workplace):
-    for words in commands(page, "dnnmso"):
-        waits = "--serve" in words or words[1:] == ["replay", "logs/paper.mcap"]
-        # What waits for a person, and what draws, is tried in test_viewer.py and below.
-        if not waits and "--screenshot" not in words:
-            run(words, workplace)
+@pytest.mark.parametrize(
+    "command", [c for c in all_commands("dnnmso") if not is_tried_elsewhere(c) | draws(c)]
+)
+def test_the_command_runs(command, workplace, monkeypatch):
+    monkeypatch.chdir(workplace)
+    invoke(command)
 
 
 @needs_vulkan
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_screenshot_on_the_page_can_be_taken(page, workplace):
-    for words in commands(page, "dnnmso"):
-        if "--screenshot" in words:
-            run(words, workplace)
+@pytest.mark.parametrize("command", [c for c in all_commands("dnnmso") if draws(c)])
+def test_the_screenshot_can_be_taken(command, workplace, monkeypatch):
+    monkeypatch.chdir(workplace)
+    invoke(command)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_make_target_on_the_page_exists(page):
-    for words in commands(page, "make"):
-        dry = ["make", "--dry-run", *words[1:]]
-        done = subprocess.run(dry, cwd=ROOT, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, (words, done.stderr)
+@pytest.mark.parametrize("command", all_commands("make"))
+def test_the_make_target_exists(command):
+    dry = ["make", "--dry-run", *shlex.split(command)[1:]]
+    done = subprocess.run(dry, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_python_block_on_the_page_runs(page, workplace):
-    for block in blocks(page, "python"):
-        subprocess.run([sys.executable, "-c", block], cwd=workplace, check=True, timeout=120)
+@pytest.mark.parametrize("page", [name for name in TEXTS if blocks(TEXTS[name], "python")])
+def test_the_pages_python_runs(page, workplace, monkeypatch):
+    """All blocks of a page, one after the other."""
+    monkeypatch.chdir(workplace)
+    names: dict[str, object] = {"__name__": "__page__"}
+    for block in blocks(TEXTS[page], "python"):
+        exec(compile(block, page, "exec"), names)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", TEXTS)
 def test_every_link_on_the_page_leads_to_a_file(page):
-    for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
+    for target in re.findall(r"\]\(([^)#\s]+)", TEXTS[page]):
         if "://" not in target:
-            assert (page.parent / target).exists(), target
+            assert (ROOT / page).parent.joinpath(target).exists(), target
+
+
+def test_every_test_that_a_page_names_exists():
+    code = "".join(file.read_text(encoding="utf-8") for file in (ROOT / "tests").glob("test_*.py"))
+    for page, text in TEXTS.items():
+        for name in re.findall(r"`(test_\w+)`", text):
+            assert f"def {name}(" in code, (page, name)
 
 
 def test_the_readme_does_have_commands_and_pictures():
-    assert len(commands(ROOT / "README.md", "dnnmso")) > 4
-    assert len(commands(ROOT / "README.md", "make")) == 2
-    assert (ROOT / "README.md").read_text(encoding="utf-8").count("![") > 4
+    readme = TEXTS["README.md"]
+    assert len(commands("dnnmso", readme)) > 4
+    assert len(commands("make", readme)) == 2
+    assert readme.count("![") > 4

@@ -28,6 +28,7 @@ def _commands() -> str:
     options = whole[whole.index("**Usage**") : whole.index("**Commands**")]
     links = " · ".join(f"[`{name}`](#{name})" for name in names)
     sections = [
-        text.replace("\n", f" {{ #{name} }}\n", 1) for name, text in zip(names, commands, strict=True)
+        text.replace("\n", f" {{ #{name} }}\n", 1)
+        for name, text in zip(names, commands, strict=True)
     ]
     return "\n".join([links, "", options, *sections])

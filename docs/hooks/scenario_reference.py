@@ -76,7 +76,9 @@ def _row(anchor: str, required: bool, shape: Shape) -> str:
         "required" if required else _default(shape.default),
         shape.description,
     ]
-    return "| " + " | ".join(cell.replace("|", "&#124;").replace("\n", " ") for cell in cells) + " |\n"
+    return (
+        "| " + " | ".join(cell.replace("|", "&#124;").replace("\n", " ") for cell in cells) + " |\n"
+    )
 
 
 def _allowed(shape: Shape) -> str:
@@ -87,7 +89,9 @@ def _allowed(shape: Shape) -> str:
 
 def _option(shape: Shape) -> str:
     if shape.kinds:
-        return ", ".join(f"[{kind}]{_link(_models(part.schema)[0])}" for kind, part in shape.kinds.items())
+        return ", ".join(
+            f"[{kind}]{_link(_models(part.schema)[0])}" for kind, part in shape.kinds.items()
+        )
     if "properties" in shape.schema:
         return ", ".join(f"`{{{key}: …}}`, {shape.description}" for key in shape.keys)
     links = ", ".join(f"[{name}]{_link(name)}" for name in _models(shape.schema))
