@@ -18,7 +18,7 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[2]
 README = "README.md"
-PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md", README: "index.md"}
+PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#|/)([^)\s#]+)")
 SECTION = re.compile(r"^\[[^\]]+\]\((?:\.\./)+README\.md#([a-z-]+)\)$", re.MULTILINE)
 
@@ -26,8 +26,6 @@ SECTION = re.compile(r"^\[[^\]]+\]\((?:\.\./)+README\.md#([a-z-]+)\)$", re.MULTI
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages of the root, and each file that some page links to."""
     for source, name in PAGES.items():
-        if source == README:
-            continue
         text = (ROOT / source).read_text(encoding="utf-8")
         files.append(File.generated(config, name, content=text))
     for page in list(files.documentation_pages()):
@@ -61,8 +59,8 @@ def _target(link: str, folder: str) -> tuple[str, Path | None]:
     place = posixpath.normpath(posixpath.join(folder, link))
     if place.startswith("docs/"):
         return place.removeprefix("docs/"), None
-    if place in PAGES:
-        return PAGES[place], None
+    if place in {README, *PAGES}:
+        return PAGES.get(place, "index.md"), None
     return f"files/{place}", ROOT / place
 
 
