@@ -1,4 +1,4 @@
-"""The scenario reference: every key of the JSON schema, section by section, where a page asks for it.
+"""The scenario reference: every key of the JSON schema, where a page asks for it.
 
 A section is a Strict model of `dnnmso_mj.scenario`; its keys have the anchors `section.key`.
 """
@@ -14,7 +14,7 @@ from dnnmso_mj.loading import scenario_schema
 from dnnmso_mj.loading.shape import Shape
 
 PLACE = "<!-- make docs: scenario -->"
-HEAD = "| key | allowed | unit | default | |\n| --- | --- | --- | --- | --- |\n"
+HEAD = "| key | meaning | allowed | unit | default |\n| --- | --- | --- | --- | --- |\n"
 UNIT = re.compile(r"\(((?:rad|kg|Hz|m|s|N|1/s|%)(?:[·/²³√0-9a-z/]|N·m|N)*)\)", re.IGNORECASE)
 
 Schema = dict[str, Any]
@@ -71,14 +71,13 @@ def _row(anchor: str, required: bool, shape: Shape) -> str:
     unit = UNIT.search(shape.description)
     cells = [
         f'<code id="{anchor}">{anchor.rpartition(".")[2]}</code>',
+        shape.description,
         _allowed(shape),
         unit[1] if unit else "",
         "required" if required else _default(shape.default),
-        shape.description,
     ]
-    return (
-        "| " + " | ".join(cell.replace("|", "&#124;").replace("\n", " ") for cell in cells) + " |\n"
-    )
+    plain = [cell.replace("|", "&#124;").replace("\n", " ") for cell in cells]
+    return f"| {' | '.join(plain)} |\n"
 
 
 def _allowed(shape: Shape) -> str:
