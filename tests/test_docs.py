@@ -1,7 +1,7 @@
 """README and docs: their commands run, their links lead somewhere, their Python works.
 
 Commands run in this process, each once, in the order of the pages, in one folder with the logs and
-files that the pages speak of; simulations take coarser steps. That `dnnmso` is a program is test_cli's.
+files that the pages speak of; simulations take coarser steps. test_cli.py calls the program itself.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def all_commands(program: str) -> list[str]:
 
 
 def is_tried_elsewhere(command: str) -> bool:
-    """Whether it waits for a person, as test_viewer.py tries it, or is all that test_bench.py does."""
+    """Whether it waits for a person (see test_viewer.py), or is what test_bench.py does anyway."""
     words = shlex.split(command)
     opens = words[1] == "replay" and not {"--save", "--screenshot"} & set(words)
     return opens or words[1] == "bench" or bool({"--serve", "--view"} & set(words))

@@ -13,13 +13,13 @@ from itertools import pairwise
 from typing import Any
 from xml.etree import ElementTree
 
-from latex2mathml.converter import convert
+from latex2mathml.converter import convert_to_element
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 FORMULA = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
 NUMBER = re.compile(r"\\tag\{(.*?)\}")
-XMLNS = ' xmlns="http://www.w3.org/1998/Math/MathML"'
+DISPLAY = {"div": "block", "span": "inline"}
 CLOSING = {")", "]", "‖", "|"}
 ACCENTS = {"^": "ˆ", "~": "˜", "˙": "˙", "¨": "¨", "¯": "¯"}
 FONT = "STIXTwoMath-Regular.ttf"
@@ -41,20 +41,21 @@ def _draw(formula: re.Match[str]) -> str:
     tag, text = formula.groups()
     tex = html.unescape(text).strip()[2:-2]  # without \( and \), or \[ and \]
     number = NUMBER.search(tex)
-    drawn = _mended(convert(NUMBER.sub("", tex), display="block" if tag == "div" else "inline"))
-    if "\\" in drawn:
+    drawn = _mended(convert_to_element(NUMBER.sub("", tex), display=DISPLAY[tag]))
+    if "\\" in drawn or "&amp;" in drawn:
         raise ValueError(f"no MathML for a part of {tex!r}: {drawn}")
     beside = f'<span class="number">({number[1]})</span>' if number else ""
     return f'<{tag} class="formula">{drawn}{beside}</{tag}>'
 
 
-def _mended(mathml: str) -> str:
+def _mended(root: ElementTree.Element) -> str:
     """What the converter leaves to better browsers.
 
     Accents as accents, close to their letters, and a minus that follows a sign as the sign of what
     comes after it.
     """
-    root = ElementTree.fromstring(mathml.replace(XMLNS, ""))  # HTML has no namespaces
+    for part in root.iter():
+        part.text = html.unescape(part.text or "")
     for over in root.iter("mover"):
         accent = over[1]
         if accent.text in ACCENTS:

@@ -1,4 +1,4 @@
-"""What stands outside of docs/, on the site: so links work here and where Markdown is read as it is.
+"""What stands outside of docs/, on the site: links work here and where Markdown is read as it is.
 
 CONTRIBUTING.md and CHANGELOG.md become pages. A line that is nothing but a link to a section of
 README.md becomes that section. What else is linked to outside of docs/ is copied under files/.
@@ -48,14 +48,14 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
 
 
 def _parts(markdown: str, page: File) -> Iterator[tuple[str, str]]:
-    """A page's own text and the sections of README in it, each with the folder its links start from."""
+    """A page's text and sections of README in it, each with the folder its links start from."""
     own = "" if page.src_uri in PAGES.values() else posixpath.dirname(f"docs/{page.src_uri}")
     for k, text in enumerate(SECTION.split(markdown)):
         yield (text, own) if k % 2 == 0 else (_section(text), "")
 
 
 def _target(link: str, folder: str) -> tuple[str, Path | None]:
-    """Where a link of a file in a folder of the repository leads on the site; its file if a copy."""
+    """Where a link of a file in a folder leads on the site, and the file there if it is a copy."""
     place = posixpath.normpath(posixpath.join(folder, link))
     if place.startswith("docs/"):
         return place.removeprefix("docs/"), None
