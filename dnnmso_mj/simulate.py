@@ -146,8 +146,6 @@ class Simulation:
             Status "ok" or "diverged" (with the reason), the seed and the wall time of the loop.
         """
         status, reason = "ok", ""
-        self._ticks = compiled_ticks(self.controller)
-        self._prepare()
         self.begin(start)
         started = time.perf_counter()
         try:
@@ -163,8 +161,15 @@ class Simulation:
         wall = time.perf_counter() - started
         return RunInfo(status=status, seed=self.scenario.seed, wall_s=wall, reason=reason)
 
+    @property
+    def snapshot_every(self) -> int:
+        """Ticks between two snapshots."""
+        return max(1, round(SNAPSHOT_PERIOD / self.scenario.dt))
+
     def begin(self, start: State | None = None) -> None:
         """Go to the start of the scenario, or to a state that a run of it was in."""
+        self._ticks = compiled_ticks(self.controller)
+        self._prepare()
         if self._first_state is None:
             self._first_state = self.controller.state()
         else:
@@ -243,7 +248,7 @@ class Simulation:
         return reading
 
     def _loop(self, recorder: Recorder, progress: Progress | None, n_ticks: int) -> None:
-        snapshot_every = max(1, round(SNAPSHOT_PERIOD / self.scenario.dt))
+        snapshot_every = self.snapshot_every
         block = min(getattr(recorder, "block", BLOCK), LARGEST_BLOCK)
         self.world.counts[START_NS] = time.monotonic_ns() + HEAD_START_NS
         while self._tick < n_ticks:

@@ -24,6 +24,7 @@ from dnnmso_mj.cli import (
     logs,
     margins,
     report,
+    resume,
     run,
     scenarios,
     sweep,
@@ -157,6 +158,7 @@ app.command()(logs.plot)
 app.command()(logs.replay)
 app.command()(logs.info)
 app.command()(logs.recover)
+app.command()(resume.resume)
 app.command()(scenarios.schema)
 app.command()(scenarios.scenarios)
 app.command()(bench.bench)

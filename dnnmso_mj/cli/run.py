@@ -70,7 +70,7 @@ def run(
     except RunInterrupted as stop:
         ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
         raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
-    figures, undrawn = _draw(done) if plot else ([], None)
+    figures, undrawn = draw(done) if plot else ([], None)
     info = done.trace.info
     if as_json:
         print(json.dumps({
@@ -85,7 +85,7 @@ def run(
             **({"real_time": asdict(timing(done.trace))} if real_time else {}),
         }))  # fmt: skip
     else:
-        _print_summary(done.trace, done.log, figures)
+        print_summary(done.trace, done.log, figures)
         if real_time:
             _print_timing(timing(done.trace))
     if undrawn is not None:
@@ -95,7 +95,7 @@ def run(
         raise typer.Exit(DIVERGED)
 
 
-def _draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
+def draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
     """The figures beside the log, and why there are none of those that could not be written."""
     if len(done.trace) == 0:
         return [], None
@@ -108,7 +108,7 @@ def _draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
         return [], error
 
 
-def _print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
+def print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
     from rich.table import Table
 
     info = trace.info
