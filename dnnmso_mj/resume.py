@@ -44,13 +44,13 @@ class Resumed:
         run: the whole run, from its first tick, and its log.
         tick: where it went on.
         checked: how many ticks before that were computed again and are those of the log.
-        branched: what was changed there, and what became of the controller; "" for nothing.
+        told: the event that says what was changed there; "" for nothing.
     """
 
     run: LoggedRun
     tick: int
     checked: int
-    branched: str
+    told: str
 
 
 def resume(
@@ -80,6 +80,8 @@ def resume(
         RunInterrupted: Ctrl-C; the new log is whole, with the metrics of what was run.
     """
     source = read_recorded(log)
+    if out is not None and out.resolve() == log.resolve():
+        raise LogError(f"--out {out}: is the log itself; allowed: another name")
     tick = _tick(source, at)
     segment = source.segment(tick)
     scenario = change_scenario(segment.scenario, sets, log)
@@ -87,39 +89,85 @@ def resume(
         raise ScenarioError(
             f"duration = {scenario.duration:g}: ends before --at {at:g}; allowed: {at:g} or more"
         )
-    before = _model(source, segment)
+    own = _model(source, segment)
     same = scenario.plant.model == segment.scenario.plant.model
-    mjcf = before if same else Mjcf.read(find_model(scenario.plant.model))
-    state, checked = state_at(source, segment, before, tick)
+    mjcf = own if same else Mjcf.read(find_model(scenario.plant.model))
     simulation = Simulation(scenario, mjcf)
-    branched = ""
-    if scenario != segment.scenario and state is not None:
-        state, told = branch(state, segment.scenario, simulation)
-        branched = f"{', '.join(sets)}; {told}"
-    layout = _common(source.layout, simulation.layout)
-    records, files = _history(source, tick, mjcf, branched)
-    records[RESUMED] = {"source": log.name, "at": repr(at), "sets": json.dumps(list(sets))}
-    with McapRecorder(
-        out or _free_name(log, tick * scenario.dt),
-        layout,
-        scenario,
-        Scene(simulation.plant.model),
-        mjcf.text,
-        force=force,
-        records=records,
-        files=files,
-    ) as recorder:
+    state, checked = state_at(source, segment, own, tick)
+    last = segment
+    if scenario != segment.scenario:
+        told = ""
+        if state is not None:
+            state, became = branch(state, segment.scenario, simulation)
+            told = f"resumed from {log.name} with {', '.join(sets)}; {became}"
+        last = Segment(tick, scenario, told=told)
+    where = {"source": log.name, "at": repr(at), "sets": json.dumps(list(sets))}
+    target = out or _free_name(log, tick * scenario.dt)
+    follow = _Continuation(source, tick, last, state, simulation, mjcf)
+    done = follow.record(target, where, force, progress)
+    return Resumed(done, tick, checked, last.told if last.first == tick else "")
 
-        def run() -> RunInfo:
-            _copy_before(source, tick, _Widened(recorder, source.layout, layout))
-            if state is not None and branched:
-                _mark_branch(recorder, simulation, state, log.name, branched)
-            return simulation.run(
-                _Widened(recorder, simulation.layout, layout), progress, start=state
-            )
 
-        done = run_to_end(run, recorder, scenario, layout)
-    return Resumed(done, tick, checked, branched)
+@dataclass(frozen=True)
+class _Continuation:
+    """What is left to run, and the log that it goes on from.
+
+    Args:
+        source: the log.
+        tick: of it, to go on from.
+        last: the segment to go on with.
+        state: to go on in; None: at the start.
+        simulation, mjcf: of that segment.
+    """
+
+    source: Recorded
+    tick: int
+    last: Segment
+    state: State | None
+    simulation: Simulation
+    mjcf: Mjcf
+
+    def record(
+        self, out: Path, where: dict[str, str], force: bool, progress: Progress | None
+    ) -> LoggedRun:
+        """Write the whole run; `where` says what it goes on from."""
+        scenario, ours, theirs = self.last.scenario, self.simulation.layout, self.source.layout
+        layout = ours if ours.n_layers >= theirs.n_layers else theirs
+        segments, files = self._history()
+        records = {RESUMED: where, **({SEGMENTS: segments_record(segments)} if segments else {})}
+        scene = Scene(self.simulation.plant.model)
+        with McapRecorder(
+            out, layout, scenario, scene, self.mjcf.text, force=force, records=records, files=files
+        ) as recorder:
+
+            def run() -> RunInfo:
+                _copy_before(self.source, self.tick, _Widened(recorder, theirs, layout))
+                return self._go_on(_Widened(recorder, ours, layout), progress)
+
+            return run_to_end(run, recorder, scenario, layout)
+
+    def _go_on(self, recorder: Recorder, progress: Progress | None) -> RunInfo:
+        state, simulation = self.state, self.simulation
+        if state is not None and self.last.first == self.tick:
+            t = self.tick * self.last.scenario.dt
+            recorder.event(Event(t, "info", self.last.told))
+            if self.tick % simulation.snapshot_every:  # else the run keeps one
+                recorder.snapshot("controller", t, state.controller or {})
+                recorder.snapshot("world", t, state.world)
+        return simulation.run(recorder, progress, start=state)
+
+    def _history(self) -> tuple[list[Segment], dict[str, bytes]]:
+        """The segments, if there are several, and the models that are not the log's own."""
+        segments, files = [], {}
+        for part in self.source.segments:
+            if part.first < self.last.first:
+                text = self.source.files[part.model]
+                own = text == self.mjcf.text.encode()
+                name = MODEL if own else f"model-{part.first}.xml"
+                segments.append(replace(part, model=name))
+                if not own:
+                    files[name] = text
+        return [*segments, replace(self.last, model=MODEL)] if segments else [], files
 
 
 def _tick(source: Recorded, at: float) -> int:
@@ -136,29 +184,6 @@ def _model(source: Recorded, segment: Segment) -> Mjcf:
         return Mjcf(source.files[segment.model].decode())
     except KeyError as error:
         raise LogError(f"{source.path}: has no attachment {segment.model}") from error
-
-
-def _common(one: StepLayout, other: StepLayout) -> StepLayout:
-    """The layout of rows that holds the rows of both."""
-    return one if one.n_layers >= other.n_layers else other
-
-
-def _history(
-    source: Recorded, tick: int, mjcf: Mjcf, branched: str
-) -> tuple[dict[str, dict[str, str]], dict[str, bytes]]:
-    """What a log says of its segments but the last: a record, and models that are not its own."""
-    parts = [part for part in source.segments if part.first <= tick]
-    first = tick if branched else parts[-1].first
-    earlier, files = [], {}
-    for part in parts:
-        if part.first >= first:
-            continue
-        text = source.files[part.model]
-        name = MODEL if text == mjcf.text.encode() else f"model-{part.first}.xml"
-        earlier.append(replace(part, model=name))
-        if name != MODEL:
-            files[name] = text
-    return {SEGMENTS: segments_record(earlier, first)} if earlier else {}, files
 
 
 def _copy_before(source: Recorded, tick: int, recorder: Recorder) -> None:
@@ -183,17 +208,6 @@ def _copy_before(source: Recorded, tick: int, recorder: Recorder) -> None:
 def _append(recorder: Recorder, rows: Array) -> None:
     for first in range(0, len(rows), LARGEST_BLOCK):
         recorder.append(rows[first : first + LARGEST_BLOCK])
-
-
-def _mark_branch(
-    recorder: Recorder, simulation: Simulation, state: State, name: str, branched: str
-) -> None:
-    """Say what changed, and keep the state from which a later run can go on."""
-    t = state.tick * simulation.scenario.dt
-    recorder.event(Event(t, "info", f"resumed from {name} with {branched}"))
-    if state.tick % simulation.snapshot_every:  # else the run does
-        recorder.snapshot("controller", t, state.controller or {})
-        recorder.snapshot("world", t, state.world)
 
 
 class _Widened:

@@ -108,7 +108,8 @@ def draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
         return [], error
 
 
-def print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
+def print_summary(trace: Trace, log: Path, figures: list[Path], since: int = 0) -> None:
+    """Metrics, speed and files of a run, of which the ticks from `since` on were simulated now."""
     from rich.table import Table
 
     info = trace.info
@@ -119,7 +120,7 @@ def print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
     for name, value in info.metrics.items():
         table.add_row(name, number(value), UNITS.get(name, ""))
     print_table(table, soft_wrap=True)
-    simulated = len(trace) * trace.scenario.dt
+    simulated = (len(trace) - since) * trace.scenario.dt
     print(f"{simulated:g} s simulated in {info.wall_s:.2f} s")
     print(f"log      {near(log)}")
     for figure in figures:

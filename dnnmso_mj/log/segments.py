@@ -6,8 +6,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pydantic import ValidationError
-
 from dnnmso_mj.log.format import MODEL
 from dnnmso_mj.scenario import Scenario
 
@@ -22,20 +20,19 @@ class Segment:
         first: its first tick.
         scenario: in force from then on.
         model: the attachment that holds its MJCF.
+        told: the event that says how it began; "" of the first.
     """
 
     first: int
     scenario: Scenario
     model: str = MODEL
+    told: str = ""
 
 
-def segments_record(earlier: Sequence[Segment], first: int) -> dict[str, str]:
-    """All segments but the last, whose scenario is the log's own, and where that begins."""
-    rows = [
-        {"first": part.first, "model": part.model, "scenario": part.scenario.model_dump_json()}
-        for part in earlier
-    ]
-    return {"earlier": json.dumps(rows), "first": str(first)}
+def segments_record(segments: Sequence[Segment]) -> dict[str, str]:
+    """The metadata record of all segments."""
+    rows = [vars(part) | {"scenario": part.scenario.model_dump(mode="json")} for part in segments]
+    return {"json": json.dumps(rows)}
 
 
 def read_segments(records: Mapping[str, Mapping[str, str]], scenario: Scenario) -> list[Segment]:
@@ -48,12 +45,17 @@ def read_segments(records: Mapping[str, Mapping[str, str]], scenario: Scenario) 
     Raises:
         ValueError: the record is damaged, or of another version of this package.
     """
-    record = records.get(SEGMENTS, {"earlier": "[]", "first": "0"})
+    if SEGMENTS not in records:
+        return [Segment(0, scenario)]
     try:
-        earlier = [
-            Segment(int(row["first"]), Scenario.model_validate_json(row["scenario"]), row["model"])
-            for row in json.loads(record["earlier"])
+        return [
+            Segment(
+                first=int(row["first"]),
+                scenario=Scenario.model_validate_json(json.dumps(row["scenario"])),
+                model=str(row["model"]),
+                told=str(row["told"]),
+            )
+            for row in json.loads(records[SEGMENTS]["json"])
         ]
-        return [*earlier, Segment(int(record["first"]), scenario)]
-    except (ValidationError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:  # pydantic's is a ValueError
         raise ValueError(f"its record {SEGMENTS!r} is not one of this version") from error
