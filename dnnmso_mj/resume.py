@@ -13,9 +13,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 
+from dnnmso_mj.assets import put_back, read_assets
 from dnnmso_mj.branching import branch
 from dnnmso_mj.errors import LogError, ScenarioError
 from dnnmso_mj.loading.changing import change_scenario
@@ -89,22 +92,23 @@ def resume(
         raise ScenarioError(
             f"duration = {scenario.duration:g}: ends before --at {at:g}; allowed: {at:g} or more"
         )
-    own = _model(source, segment)
-    same = scenario.plant.model == segment.scenario.plant.model
-    mjcf = own if same else Mjcf.read(find_model(scenario.plant.model))
-    simulation = Simulation(scenario, mjcf)
-    state, checked = state_at(source, segment, own, tick)
-    last = segment
-    if scenario != segment.scenario:
-        told = ""
-        if state is not None:
-            state, became = branch(state, segment.scenario, simulation)
-            told = f"resumed from {log.name} with {', '.join(sets)}; {became}"
-        last = Segment(tick, scenario, told=told)
-    where = {"source": log.name, "at": repr(at), "sets": json.dumps(list(sets))}
-    target = out or _free_name(log, tick * scenario.dt)
-    follow = _Continuation(source, tick, last, state, simulation, mjcf)
-    done = follow.record(target, where, force, progress)
+    with TemporaryDirectory(prefix="dnnmso-") as folder:
+        own = _model(source, segment, Path(folder))
+        same = scenario.plant.model == segment.scenario.plant.model
+        model = own if same else _model_file(scenario.plant.model)
+        simulation = Simulation(scenario, model.mjcf)
+        state, checked = state_at(source, segment, own.mjcf, tick)
+        last = segment
+        if scenario != segment.scenario:
+            told = ""
+            if state is not None:
+                state, became = branch(state, segment.scenario, simulation)
+                told = f"resumed from {log.name} with {', '.join(sets)}; {became}"
+            last = Segment(tick, scenario, told=told)
+        where = {"source": log.name, "at": repr(at), "sets": json.dumps(list(sets))}
+        target = out or _free_name(log, tick * scenario.dt)
+        follow = _Continuation(source, tick, last, state, simulation, model)
+        done = follow.record(target, where, force, progress)
     return Resumed(done, tick, checked, last.told if last.first == tick else "")
 
 
@@ -117,7 +121,7 @@ class _Continuation:
         tick: of it, to go on from.
         last: the segment to go on with.
         state: to go on in; None: at the start.
-        simulation, mjcf: of that segment.
+        simulation, model: of that segment.
     """
 
     source: Recorded
@@ -125,7 +129,7 @@ class _Continuation:
     last: Segment
     state: State | None
     simulation: Simulation
-    mjcf: Mjcf
+    model: _Model
 
     def record(
         self, out: Path, where: dict[str, str], force: bool, progress: Progress | None
@@ -137,7 +141,7 @@ class _Continuation:
         records = {RESUMED: where, **({SEGMENTS: segments_record(segments)} if segments else {})}
         scene = Scene(self.simulation.plant.model)
         with McapRecorder(
-            out, layout, scenario, scene, self.mjcf.text, force=force, records=records, files=files
+            out, layout, scenario, scene, self.model.text, force=force, records=records, files=files
         ) as recorder:
 
             def run() -> RunInfo:
@@ -158,15 +162,15 @@ class _Continuation:
 
     def _history(self) -> tuple[list[Segment], dict[str, bytes]]:
         """The segments, if there are several, and the models that are not the log's own."""
-        segments, files = [], {}
+        segments, files = [], dict(self.model.files)
         for part in self.source.segments:
             if part.first < self.last.first:
                 text = self.source.files[part.model]
-                own = text == self.mjcf.text.encode()
+                own = text == self.model.text.encode()
                 name = MODEL if own else f"model-{part.first}.xml"
                 segments.append(replace(part, model=name))
                 if not own:
-                    files[name] = text
+                    files |= {name: text, **self.source.assets}
         return [*segments, replace(self.last, model=MODEL)] if segments else [], files
 
 
@@ -178,12 +182,26 @@ def _tick(source: Recorded, at: float) -> int:
     return round(at / dt)
 
 
-def _model(source: Recorded, segment: Segment) -> Mjcf:
-    """The model of a segment, from the log alone."""
-    try:
-        return Mjcf(source.files[segment.model].decode())
-    except KeyError as error:
-        raise LogError(f"{source.path}: has no attachment {segment.model}") from error
+class _Model(NamedTuple):
+    """A model and all that a log keeps of it."""
+
+    mjcf: Mjcf
+    text: str
+    files: Mapping[str, bytes]
+
+
+def _model(source: Recorded, segment: Segment, folder: Path) -> _Model:
+    """The model of a segment, from the log alone; its meshes go to a folder."""
+    data = source.files.get(segment.model)
+    if data is None:
+        raise LogError(f"{source.path}: has no attachment {segment.model}; it cannot be resumed")
+    text = data.decode()
+    return _Model(put_back(text, source.assets, folder), text, source.assets)
+
+
+def _model_file(name: str) -> _Model:
+    mjcf = Mjcf.read(find_model(name))
+    return _Model(mjcf, mjcf.text, read_assets(mjcf))
 
 
 def _copy_before(source: Recorded, tick: int, recorder: Recorder) -> None:

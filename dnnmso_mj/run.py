@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from dnnmso_mj.assets import read_assets
 from dnnmso_mj.errors import LogError, RunInterrupted
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.paths import find_model, logs_dir
@@ -118,16 +119,18 @@ def _finish(recorder: McapRecorder, scenario: Scenario, layout: StepLayout, info
 
 def _open_log(simulation: Simulation, mjcf: Mjcf, out: Path | None, force: bool) -> McapRecorder:
     scene = Scene(simulation.plant.model)
-    scenario = simulation.scenario
+    scenario, files = simulation.scenario, read_assets(mjcf)
     if out is not None:
-        return McapRecorder(out, simulation.layout, scenario, scene, mjcf.text, force=force)
+        return McapRecorder(
+            out, simulation.layout, scenario, scene, mjcf.text, force=force, files=files
+        )
     for number in range(1, MAX_NUMBERED):
         suffix = f"-{number}" if number > 1 else ""
         path = logs_dir() / f"{scenario.name}{suffix}.mcap"
         if path.exists():
             continue
         try:
-            return McapRecorder(path, simulation.layout, scenario, scene, mjcf.text)
+            return McapRecorder(path, simulation.layout, scenario, scene, mjcf.text, files=files)
         except LogError:
             if not path.exists():
                 raise

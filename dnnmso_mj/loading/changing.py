@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -19,8 +20,8 @@ from dnnmso_mj.scenario import Scenario
 MODEL = ("plant", "model")
 # What a run that has begun cannot have otherwise, and why.
 SETTLED = {
-    "dt": "the ticks before have another; allowed: the log's own, or `dnnmso run`",
-    "initial": "the run has begun; allowed: anything that acts from now on",
+    "dt": "the ticks before have another; allowed: what they have",
+    "initial": "the run has begun; allowed: what acts from now on",
 }
 
 
@@ -38,33 +39,30 @@ def change_scenario(scenario: Scenario, overrides: Sequence[str], source: Path) 
             begun cannot change, or makes a scenario that could not be loaded.
     """
     sets, grafts, complaints = graft_sets(parse_overrides(overrides))
+    places = Places(source, None, sets, grafts)
     data = scenario.model_dump(mode="json")
+    settled = {key: data[key] for key in SETTLED}
     complaints += apply_overrides(data, sets)
-    complaints += _resolve_model(data, sets)
-    changed = None
+    begun = [
+        complain((key,), data, why) for key, why in SETTLED.items() if data[key] != settled[key]
+    ]
+    complaints += begun or _resolve_model(data, sets)
     try:
         changed = Scenario.model_validate(data)
     except ValidationError as error:
-        complaints += explain(error, data)
-    if changed is not None:
-        complaints += [
-            complain((key,), data, problem)
-            for key, problem in SETTLED.items()
-            if getattr(changed, key) != getattr(scenario, key)
-        ]
-    if changed is None or complaints:
-        places = Places(source, None, sets, grafts)
+        complaints += [] if begun else explain(error, data)
+    if complaints:
         raise ScenarioError("\n".join(f"{_place(places, c)}: {c.text}" for c in complaints))
     return changed
 
 
-def _resolve_model(data: dict[str, object], sets: Sequence[Override]) -> list[Complaint]:
+def _resolve_model(data: dict[str, Any], sets: Sequence[Override]) -> list[Complaint]:
     """Replace a plant.model that was set by what it is found by from any folder."""
     name = lookup(data, MODEL)
     if not isinstance(name, str) or not any(item.covers(MODEL) for item in sets):
         return []
     try:
-        data["plant"] |= {"model": model_name(find_model(name))}  # type: ignore[operator]
+        data["plant"]["model"] = model_name(find_model(name))
     except ScenarioError as error:
         return [complain(MODEL, data, str(error))]
     return []
