@@ -17,7 +17,7 @@ from dnnmso_mj.resume import resume
 
 HARD = """
 name: hard
-duration: 1.3
+duration: 1.12
 controller: {kind: dnn_mso_replay}
 reference: {kind: sinusoid, phase: [0.0, 1.5707963267948966]}
 plant: {model: MODEL, masses: [1.0, 2.3], lengths: [1.0, 1.0], integrator: implicitfast}
@@ -37,22 +37,22 @@ imperfections:
 events:
   - {kind: payload, at: 0.31, mass: 0.5}
   - {kind: push, at: 0.42, duration: 0.7, torque: [3.0, 0.0], force: [4.0, 2.0]}
-  - {kind: freeze, at: 1.2, what: model}
+  - {kind: freeze, at: 1.06, what: model}
 """
 PAPER = """
 name: paper
-duration: 1.4
+duration: 1.12
 controller: {kind: dnn_mso}
 reference: {kind: sinusoid, phase: [0.0, 1.5707963267948966]}
 plant: {model: MODEL, masses: [1.0, 2.3], lengths: [1.0, 1.0]}
 """
 SLOW = """
 name: slow
-duration: 2.8
+duration: 2.4
 dt: 0.002
 seed: 3
 controller: {kind: pid}
-reference: {kind: waypoints, times: [0.2, 1.0, 2.5], points: [[0.5, 0.5], [0.8, 0.1], [0.2, 0.3]]}
+reference: {kind: waypoints, times: [0.2, 1.0, 2.2], points: [[0.5, 0.5], [0.8, 0.1], [0.2, 0.3]]}
 plant: {model: MODEL, masses: [1.0, 2.3], lengths: [1.0, 1.0], integrator: euler}
 imperfections:
   torque_limit: 90.0

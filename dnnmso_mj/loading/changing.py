@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ def change_scenario(scenario: Scenario, overrides: Sequence[str], source: Path) 
     sets, grafts, complaints = graft_sets(parse_overrides(overrides))
     places = Places(source, None, sets, grafts)
     data = scenario.model_dump(mode="json")
-    settled = {key: data[key] for key in SETTLED}
+    settled = deepcopy({key: data[key] for key in SETTLED})
     complaints += apply_overrides(data, sets)
     begun = [
         complain((key,), data, why) for key, why in SETTLED.items() if data[key] != settled[key]
