@@ -16,7 +16,7 @@ from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.loading.overrides import parse_overrides
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 STATES = 400  # that a model is asked about inside, and as many outside
 LOOKS = 2000  # states of the reference that make the region

@@ -13,7 +13,7 @@ import typer
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dnnmso_mj.simulate import Progress
+    from dnnmso_mj.simulation import Progress
     from dnnmso_mj.sweep.statistics import Spread
 
 DIVERGED = 1

@@ -107,6 +107,6 @@ def called(who: str) -> Iterator[None]:
 
 def told(error: Exception) -> str:
     """An exception with the place that raised it."""
-    frames = traceback.extract_tb(error.__traceback__)
+    frames = traceback.extract_tb(error.__traceback__)[1:]  # the first is the caller's
     place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
     return f"{type(error).__name__}: {error}{place}"

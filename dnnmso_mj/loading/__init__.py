@@ -211,7 +211,7 @@ def _resolve_model(data: Any, file: Path, sets: Sequence[Override]) -> list[Comp
         return []
     base = Path.cwd() if any(item.covers(path) for item in sets) else file.absolute().parent
     try:
-        data["plant"]["model"] = model_name(find_model(name, base))
+        data["plant"]["model"] = model_name(find_model(name, base), name)
     except ScenarioError as error:
         return [complain(path, data, str(error))]
     return []

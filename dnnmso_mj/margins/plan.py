@@ -16,7 +16,7 @@ from dnnmso_mj.margins.search import PRECISION, Found, find_margin
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 from dnnmso_mj.sweep.plan import code_identity
 from dnnmso_mj.sweep.task import Row, failed_row
 from dnnmso_mj.wording import clean

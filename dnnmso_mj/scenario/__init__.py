@@ -102,7 +102,7 @@ class Plant(Strict):
     """The robot that MuJoCo steps."""
 
     model: str = PAPER_MODEL
-    """MJCF: the name of a shipped model, or a path relative to the scenario file."""
+    """MJCF: a shipped model's name, a path from this file, or package:file.xml of a package."""
     links: Literal["point_mass", "rod"] = "point_mass"
     """Mass of each link: a point at its tip, or a uniform thin rod."""
     masses: Positives | None = (1.0, 2.3)

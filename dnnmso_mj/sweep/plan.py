@@ -19,7 +19,7 @@ from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.provenance import git_commit, software_versions
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 from dnnmso_mj.sources import sources_digest
 from dnnmso_mj.sweep.task import Task
 from dnnmso_mj.wording import clean
