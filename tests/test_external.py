@@ -11,7 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from outside_samples import CANARY, LAWS, write_package
+from typer.main import get_command
 
+from dnnmso_mj.cli import app
+from dnnmso_mj.cli.audit import audit
+from dnnmso_mj.cli.compare import compare
+from dnnmso_mj.cli.margins import margins
+from dnnmso_mj.cli.sweep import sweep
 from dnnmso_mj.comparison.plan import plan_comparison
 from dnnmso_mj.controllers import Inputs, build_controller
 from dnnmso_mj.dynamics import TwoLink
@@ -55,7 +61,7 @@ def package(tmp_path, monkeypatch) -> Path:
 def outside(python: str, *sets: str, **settings) -> Scenario:
     """The paper's scenario with a controller from outside."""
     spec = json.dumps({"kind": "external", "python": python, "settings": settings})
-    return load_scenario("paper", [SHORT, *sets, f"controller={spec}"], trust=True)
+    return load_scenario("paper", [SHORT, f"controller={spec}", *sets], trust=True)
 
 
 def run_pd(*sets: str) -> Trace:
@@ -213,19 +219,47 @@ def test_a_controller_of_another_file_is_refused_too_with_its_line(canary, tmp_p
     assert not canary.exists()
 
 
-@pytest.mark.parametrize("words", [["sweep", "--seeds", "0"], ["audit"], ["run"]])
-def test_commands_take_the_flag(words, canary):
-    (canary.parent / "own.yaml").write_text(
+def test_every_command_that_changes_a_scenario_can_be_told_to_trust_it():
+    commands = get_command(app).commands
+    for name, command in commands.items():
+        options = {option for parameter in command.params for option in parameter.opts}
+        assert ("--trust" in options) == ("--set" in options), name
+    assert {"run", "sweep", "compare", "margins", "tune", "audit"} <= set(commands)
+
+
+COMMANDS = {
+    "sweep": lambda **how: sweep("own.yaml", "0", **how),
+    "compare": lambda **how: compare("paper", "mine.yaml,pd", "0", **how),
+    "margins": lambda **how: margins("paper", "mine.yaml", "0", **how),
+    "audit": lambda **how: audit("own.yaml", **how),
+}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_hands_its_trust_on(name, canary):
+    controller = "controller: {kind: external, python: 'canary.py:Name'}\n"
+    Path("mine.yaml").write_text(controller)
+    Path("own.yaml").write_text("name: own\nreference: {kind: sinusoid}\n" + controller)
+    with pytest.raises(ScenarioError, match="runs code of its own"):
+        COMMANDS[name]()
+    assert not canary.exists()
+    with pytest.raises(ScenarioError, match="is of NoneType; allowed: a class"):
+        COMMANDS[name](trust=True)
+    assert canary.exists()
+
+
+def test_the_command_line_refuses_in_one_line_and_runs_what_it_is_told_to_trust(canary):
+    Path("own.yaml").write_text(
         "name: own\nreference: {kind: sinusoid}\n"
         "controller: {kind: external, python: 'canary.py:Name'}\n"
     )
-    command = [sys.executable, "-m", "dnnmso_mj", words[0], "own.yaml", *words[1:]]
     for flags, ran in (([], False), (["--trust"], True)):
-        done = subprocess.run([*command, *flags], capture_output=True, text=True, check=False)
+        command = [sys.executable, "-m", "dnnmso_mj", "run", "own.yaml", *flags]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
         said = "is of NoneType; allowed: a class" if ran else "own.yaml:3: controller.python"
         assert (done.returncode, said in done.stderr) == (2, True), done.stderr
         assert canary.exists() == ran
-    assert "Traceback" not in done.stderr
+        assert "Traceback" not in done.stderr
 
 
 def test_an_entry_point_needs_no_trust(package):
