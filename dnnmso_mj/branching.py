@@ -8,9 +8,9 @@ import numpy as np
 
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scenario.controller import inversion
-from dnnmso_mj.simulate import Simulation
+from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.theory import UNDEFINED, TrackingBounds, start_bounds
-from dnnmso_mj.world_state import State
+from dnnmso_mj.world_state import EXTERNAL, State
 
 Array = np.ndarray
 
@@ -20,8 +20,9 @@ def branch(state: State, before: Scenario, simulation: Simulation) -> tuple[Stat
 
     The arm keeps q and q̇. A controller of the same kind keeps its state where all its arrays have
     the shapes that they had; any other begins anew with the present reading. Delays keep the newest
-    of what is on its way, and go on from the oldest where they have become longer. Bounds begin
-    anew where the reference or the law that they are of is another.
+    of what is on its way, and go on from the oldest where they have become longer. Imperfections
+    from outside go on where they are as many and have the same state. Bounds begin anew where the
+    reference or the law that they are of is another.
 
     Args:
         state: of the run so far.
@@ -37,6 +38,12 @@ def branch(state: State, before: Scenario, simulation: Simulation) -> tuple[Stat
     world = dict(state.world)
     for name in ("actuators_past", "sensors_past"):
         world[name] = _refill(world[name], len(fresh.world[name]), state.tick)
+    outside = [
+        {name: values for name, values in each.items() if name.startswith(EXTERNAL)}
+        for each in (world, fresh.world)
+    ]
+    if misfit(*outside):
+        world = {n: v for n, v in world.items() if n not in outside[0]} | outside[1]
     bounded = (inversion(now.controller), now.reference)
     anew = bounded != (inversion(before.controller), before.reference)
     if anew:

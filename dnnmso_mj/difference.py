@@ -208,6 +208,9 @@ def _arrays(one: Mapping[str, Array], other: Mapping[str, Array]) -> Iterator[st
             yield f"{key} {_alone(key in one)}"
         elif one[key].shape != other[key].shape:
             yield f"{key} of shape {one[key].shape}, and {other[key].shape}"
+        elif one[key].dtype.kind in "SU":
+            if not np.array_equal(one[key], other[key]):
+                yield key
         elif one[key].tobytes() != other[key].tobytes():
             largest = np.abs(one[key].astype(float) - other[key].astype(float)).max()
             yield f"{key} by up to {largest:.3g}"

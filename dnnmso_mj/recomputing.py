@@ -14,7 +14,7 @@ from dnnmso_mj.memory_recorder import LARGEST_BLOCK
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.provenance import git_commit, software_versions
 from dnnmso_mj.recorded import Recorded
-from dnnmso_mj.simulate import Simulation
+from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.trace import Event, StepLayout
 from dnnmso_mj.world_state import State
 

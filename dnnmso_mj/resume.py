@@ -32,7 +32,7 @@ from dnnmso_mj.recorded import Recorded, read_recorded
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.run import LoggedRun, run_to_end
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulate import Progress, Recorder, Simulation
+from dnnmso_mj.simulation import Progress, Recorder, Simulation
 from dnnmso_mj.trace import Event, RunInfo, StepLayout
 from dnnmso_mj.world_state import State
 
@@ -63,6 +63,7 @@ def resume(
     out: Path | None = None,
     *,
     force: bool = False,
+    trust: bool = False,
     progress: Progress | None = None,
 ) -> Resumed:
     """Run a log's scenario on from a time in it, and leave a log of the whole.
@@ -74,6 +75,7 @@ def resume(
         out: the new log; by default LOG-from-AT.mcap beside the log, with a number where that
             exists.
         force: whether an existing `out` is replaced.
+        trust: whether the log's scenario and `sets` may name code by import path.
         progress: called now and then with the number of ticks done since.
 
     Raises:
@@ -87,7 +89,7 @@ def resume(
         raise LogError(f"--out {out}: is the log itself; allowed: another name")
     tick = _tick(source, at)
     segment = source.segment(tick)
-    scenario = change_scenario(segment.scenario, sets, log)
+    scenario = change_scenario(segment.scenario, sets, log, trust=trust)
     if scenario.n_ticks < tick:
         raise ScenarioError(
             f"duration = {scenario.duration:g}: ends before --at {at:g}; allowed: {at:g} or more"

@@ -11,11 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dnnmso_mj.external.imperfection import Hooks
 from dnnmso_mj.imperfections.actuators import GIVEN, LAGGED
 from dnnmso_mj.plant import Plant
 from dnnmso_mj.tick import World
 
 Array = np.ndarray
+
+EXTERNAL = "external."  # begins the names of what imperfections from outside keep
 
 
 class State(NamedTuple):
@@ -26,14 +29,14 @@ class State(NamedTuple):
     world: Mapping[str, Array]  # see `capture`
 
 
-def capture(world: World, plant: Plant, flags: Array) -> dict[str, Array]:
+def capture(world: World, plant: Plant, hooks: Hooks, flags: Array) -> dict[str, Array]:
     """What the next tick depends on beside the controller, as copies.
 
     Drives and sensors without delay keep no past; it is filled in as what they have at present, so
     that a run with other imperfections can begin with it.
 
     Args:
-        world, plant: between two ticks.
+        world, plant, hooks: between two ticks.
         flags: which of the changes that make an event are in force.
 
     Returns:
@@ -44,6 +47,7 @@ def capture(world: World, plant: Plant, flags: Array) -> dict[str, Array]:
         sensors_past, sensors_last: true states and the last reading; see `Sensors`.
         bounds_…: of the tracking error, and what they are integrated with; see `TrackingBounds`.
         flags: as given.
+        external.…: what imperfections from outside keep.
     """
     actuators, sensors, bounds = world.actuators, world.sensors, world.bounds
     kept = {
@@ -56,6 +60,7 @@ def capture(world: World, plant: Plant, flags: Array) -> dict[str, Array]:
         "sensors_last": sensors.last,
         **{f"bounds_{name}": getattr(bounds, name) for name in _BOUNDS},
         "flags": flags,
+        **{f"{EXTERNAL}{name}": values for name, values in hooks.state().items()},
     }
     state = {name: np.array(values) for name, values in kept.items()}
     if actuators.prompt:
@@ -67,7 +72,7 @@ def capture(world: World, plant: Plant, flags: Array) -> dict[str, Array]:
     return state
 
 
-def restore(world: World, plant: Plant, state: Mapping[str, Array]) -> None:
+def restore(world: World, plant: Plant, hooks: Hooks, state: Mapping[str, Array]) -> None:
     """Put back what `capture` gave, but for the flags."""
     plant.restore(state["plant"])
     world.tau[:] = state["tau"]
@@ -78,6 +83,9 @@ def restore(world: World, plant: Plant, state: Mapping[str, Array]) -> None:
     world.sensors.last[:] = state["sensors_last"]
     for name in _BOUNDS:
         getattr(world.bounds, name)[:] = state[f"bounds_{name}"]
+    outside = {n.removeprefix(EXTERNAL): v for n, v in state.items() if n.startswith(EXTERNAL)}
+    if hooks:
+        hooks.restore(outside)
 
 
 _BOUNDS = ("joint", "paper", "s", "norms", "qdd")

@@ -23,7 +23,7 @@ from dnnmso_mj.reading import log_info, read_snapshots, read_trace
 from dnnmso_mj.recorded import read_recorded
 from dnnmso_mj.resume import Resumed, resume
 from dnnmso_mj.run import run_logged
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 from dnnmso_mj.trace import Trace
 
 ROOT = Path(__file__).parents[1]

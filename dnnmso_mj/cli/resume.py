@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dnnmso_mj.cli.run import draw, print_summary
-from dnnmso_mj.cli.shared import DIVERGED, Json, Log, Overrides, near, print_table, progress_bar
+from dnnmso_mj.cli.shared import (
+    DIVERGED,
+    Json,
+    Log,
+    Overrides,
+    Trust,
+    near,
+    print_table,
+    progress_bar,
+)
 from dnnmso_mj.errors import RunInterrupted
 from dnnmso_mj.wording import show
 
@@ -31,6 +40,7 @@ def resume(
     ] = None,
     force: Annotated[bool, typer.Option(help="Replace an existing log.")] = False,
     plot: Annotated[bool, typer.Option(help="Draw the figures beside the log.")] = True,
+    trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Go on from any tick of a log: bit for bit, or with something changed."""
@@ -39,7 +49,7 @@ def resume(
     sets = overrides or []
     try:
         with progress_bar(log.stem, None) as progress:
-            done = resume_log(log, at, sets, out, force=force, progress=progress)
+            done = resume_log(log, at, sets, out, force=force, trust=trust, progress=progress)
     except RunInterrupted as stop:
         raise KeyboardInterrupt(f"log: {near(stop.log)} ({stop.ticks} ticks)") from stop
     trace, info = done.run.trace, done.run.trace.info

@@ -14,6 +14,7 @@ from dnnmso_mj.loading.complaints import Complaint, complain, explain
 from dnnmso_mj.loading.overrides import Override, apply_overrides, parse_overrides
 from dnnmso_mj.loading.places import Places
 from dnnmso_mj.loading.shape import lookup
+from dnnmso_mj.loading.trust import PROBLEM, import_paths, require_trust
 from dnnmso_mj.loading.tuned import graft_sets
 from dnnmso_mj.paths import find_model, model_name
 from dnnmso_mj.scenario import Scenario
@@ -26,7 +27,9 @@ SETTLED = {
 }
 
 
-def change_scenario(scenario: Scenario, overrides: Sequence[str], source: Path) -> Scenario:
+def change_scenario(
+    scenario: Scenario, overrides: Sequence[str], source: Path, *, trust: bool = False
+) -> Scenario:
     """A scenario with some keys changed.
 
     Args:
@@ -34,11 +37,14 @@ def change_scenario(scenario: Scenario, overrides: Sequence[str], source: Path) 
         overrides: `--set` strings, as `load_scenario` takes them. Relative paths in them begin in
             the current folder.
         source: the log, for messages.
+        trust: whether both may name code by import path.
 
     Raises:
         ScenarioError: one line a problem; an override is malformed, changes what a run that has
             begun cannot change, or makes a scenario that could not be loaded.
     """
+    if not trust:
+        require_trust(scenario, f"{source}, its scenario")
     sets, grafts, complaints = graft_sets(parse_overrides(overrides))
     places = Places(source, None, sets, grafts)
     data = scenario.model_dump(mode="json")
@@ -48,6 +54,8 @@ def change_scenario(scenario: Scenario, overrides: Sequence[str], source: Path) 
         complain((key,), data, why) for key, why in SETTLED.items() if data[key] != settled[key]
     ]
     complaints += begun or _resolve_model(data, sets)
+    if not trust:
+        complaints += [complain(path, data, PROBLEM) for path, _ in import_paths(data)]
     try:
         changed = Scenario.model_validate(data)
     except ValidationError as error:
@@ -63,7 +71,7 @@ def _resolve_model(data: dict[str, Any], sets: Sequence[Override]) -> list[Compl
     if not isinstance(name, str) or not any(item.covers(MODEL) for item in sets):
         return []
     try:
-        data["plant"]["model"] = model_name(find_model(name))
+        data["plant"]["model"] = model_name(find_model(name), name)
     except ScenarioError as error:
         return [complain(MODEL, data, str(error))]
     return []

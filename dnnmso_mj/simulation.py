@@ -22,6 +22,7 @@ from dnnmso_mj.controllers import (
     compiled_ticks,
 )
 from dnnmso_mj.errors import NonFiniteError
+from dnnmso_mj.external.imperfection import Hooks
 from dnnmso_mj.imperfections.actuators import start_actuators
 from dnnmso_mj.imperfections.loads import start_loads
 from dnnmso_mj.imperfections.sensors import SensorBank, sense
@@ -110,7 +111,8 @@ class Simulation:
         n, dt = scenario.n_joints, scenario.dt
         self.scenario = scenario
         self.plant = Plant(scenario, mjcf)
-        self.reference = Reference(scenario.reference, n)
+        self.reference = Reference(scenario.reference, n, scenario.duration)
+        self.hooks = Hooks(scenario, mjcf)
         self._mjcf = None if controller else mjcf  # what the controller can be made of again
         self.controller = controller or build_controller(scenario, mjcf, watch=watch)
         self.layout = StepLayout(n, self.controller.n_layers)
@@ -121,6 +123,8 @@ class Simulation:
         self._sensors = SensorBank(scenario.imperfections, n, dt, scenario.seed, CHUNK)
         self._lookahead = lookahead(scenario.controller)
         sensors, nominal, width = self._sensors.view, self._nominal.view, self.layout.width
+        if self.hooks:
+            sensors = sensors._replace(perfect=False)
         self.world = build_world(scenario, self.plant, self._tip, sensors, nominal, pace, width)
         self._plan = plan(scenario, self.world.loads, self._tip, self.world.inputs.frozen)
         self._flags = dict.fromkeys(CHANGES, False)
@@ -153,7 +157,7 @@ class Simulation:
         except NonFiniteError as error:
             t = self._tick * self.scenario.dt
             state = self.controller.state()
-            causes = [name for name, values in state.items() if not np.isfinite(values).all()]
+            causes = [name for name, values in state.items() if not _finite(values)]
             cause = f" with {', '.join(causes)} not finite" if causes else ""
             status, reason = "diverged", f"{error}{cause} at t = {t:.6g} s"
             recorder.event(Event(t, "error", f"diverged: {reason}"))
@@ -168,7 +172,7 @@ class Simulation:
 
     def begin(self, start: State | None = None) -> None:
         """Go to the start of the scenario, or to a state that a run of it was in."""
-        self._ticks = compiled_ticks(self.controller)
+        self._ticks = None if self.hooks else compiled_ticks(self.controller)
         self._prepare()
         if self._first_state is None:
             self._first_state = self.controller.state()
@@ -181,7 +185,7 @@ class Simulation:
     def state(self) -> State:
         """The state after `begin` or a run that has not diverged, copied."""
         flags = np.array(list(self._flags.values()))
-        world = capture(self.world, self.plant, flags)
+        world = capture(self.world, self.plant, self.hooks, flags)
         return State(self._tick, self.controller.state(), world)
 
     def _prepare(self) -> None:
@@ -217,6 +221,7 @@ class Simulation:
         self._tick = self._happened = 0
         world.counts[:] = 0
         self._begin_chunk(0)
+        self.hooks.start()
         self.controller.reset(self._reading(x))
         self._flags = dict.fromkeys(CHANGES, False)
 
@@ -229,7 +234,7 @@ class Simulation:
                 self._happened += 1
         for first in range(CHUNK, start.tick + 1, CHUNK):
             self._begin_chunk(first)
-        restore(self.world, self.plant, start.world)
+        restore(self.world, self.plant, self.hooks, start.world)
         # What pushed in the period before is still to be accounted for.
         self.world = self.world._replace(loads=self.world.loads._replace(acting=True))
         self._flags = dict(zip(CHANGES, start.world["flags"].tolist(), strict=True))
@@ -245,6 +250,10 @@ class Simulation:
             last = sensors.last.copy()
             sense(sensors, x, k, k % CHUNK, reading)
             sensors.last[:] = last
+        if self.hooks:
+            before = self.hooks.state()
+            self.hooks.sense(k * self.scenario.dt, reading)
+            self.hooks.restore(before)
         return reading
 
     def _loop(self, recorder: Recorder, progress: Progress | None, n_ticks: int) -> None:
@@ -315,14 +324,25 @@ class Simulation:
             raise self._why_it_ended()
 
     def _run_interpreted(self, first: int, count: int) -> None:
-        world = self.world
+        world, hooks = self.world, self.hooks
         for k in range(first, first + count):
-            if begin_tick(world, k):
+            in_time = begin_tick(world, k)
+            hooks.sense(k * world.dt, world.inputs.x)
+            if in_time:
                 began = time.perf_counter_ns()
                 self._command = self.controller.update(world.inputs)
                 world.counts[TOOK_NS] = time.perf_counter_ns() - began
-            if end_tick(world, self._command, k):
+            if self._end_hooked(k) if hooks else end_tick(world, self._command, k):
                 return
+
+    def _end_hooked(self, k: int) -> bool:
+        """End tick k with what imperfections from outside make of the command; log the command."""
+        world, asked, row = self.world, self._command.tau, self.world.counts[ROWS]
+        given = self._command._replace(tau=self.hooks.actuate(k * world.dt, asked))
+        ended = bool(end_tick(world, given, k))
+        if world.counts[ROWS] > row:
+            world.rows[row, self.layout.slices["tau_cmd"]] = asked
+        return ended
 
     def _why_it_ended(self) -> NonFiniteError:
         """The quantity that a tick found wrong, and its value."""
@@ -355,6 +375,11 @@ class Simulation:
             for i in np.flatnonzero(flag != before):
                 level, what = ("warning", begins) if flag[i] else ("info", ends)
                 recorder.event(Event(float(rows[i, 0]), level, what))
+
+
+def _finite(values: Array) -> bool:
+    """Whether all numbers are finite; texts are."""
+    return values.dtype.kind in "SU" or bool(np.isfinite(values).all())
 
 
 def simulate(scenario: Scenario, mjcf: Mjcf | None = None, *, watch: bool = True) -> Trace:
