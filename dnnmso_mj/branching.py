@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.scenario import External, Scenario
 from dnnmso_mj.scenario.controller import inversion
 from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.theory import UNDEFINED, TrackingBounds, start_bounds
@@ -21,8 +21,8 @@ def branch(state: State, before: Scenario, simulation: Simulation) -> tuple[Stat
     The arm keeps q and q̇. A controller of the same kind keeps its state where all its arrays have
     the shapes that they had; any other begins anew with the present reading. Delays keep the newest
     of what is on its way, and go on from the oldest where they have become longer. Imperfections
-    from outside go on where they are as many and have the same state. Bounds begin anew where the
-    reference or the law that they are of is another.
+    from outside go on where they are the same code. Bounds begin anew where the reference or the
+    law that they are of is another.
 
     Args:
         state: of the run so far.
@@ -38,12 +38,10 @@ def branch(state: State, before: Scenario, simulation: Simulation) -> tuple[Stat
     world = dict(state.world)
     for name in ("actuators_past", "sensors_past"):
         world[name] = _refill(world[name], len(fresh.world[name]), state.tick)
-    outside = [
-        {name: values for name, values in each.items() if name.startswith(EXTERNAL)}
-        for each in (world, fresh.world)
-    ]
-    if misfit(*outside):
-        world = {n: v for n, v in world.items() if n not in outside[0]} | outside[1]
+    codes = [[part.python for part in each.imperfections.external] for each in (before, now)]
+    if codes[0] != codes[1]:
+        kept = {name: values for name, values in world.items() if not name.startswith(EXTERNAL)}
+        world = kept | {n: v for n, v in fresh.world.items() if n.startswith(EXTERNAL)}
     bounded = (inversion(now.controller), now.reference)
     anew = bounded != (inversion(before.controller), before.reference)
     if anew:
@@ -70,6 +68,9 @@ def _why_anew(state: State, fresh: State, before: Scenario, now: Scenario) -> st
     kinds = before.controller.kind, now.controller.kind
     if kinds[0] != kinds[1]:
         return f"it was {kinds[0]}, and is {kinds[1]}"
+    if isinstance(before.controller, External) and isinstance(now.controller, External):
+        codes = before.controller.python, now.controller.python
+        return "" if codes[0] == codes[1] else f"it was {codes[0]}, and is {codes[1]}"
     return misfit(state.controller, fresh.controller)
 
 

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from outside_samples import LAWS
 from resume_samples import SCENARIOS
 
 from dnnmso_mj.branching import _refill
 from dnnmso_mj.difference import difference
-from dnnmso_mj.errors import DnnmsoError, LogError, RunInterrupted
+from dnnmso_mj.errors import DnnmsoError, LogError, RunInterrupted, ScenarioError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.log.format import scenario_record
 from dnnmso_mj.log.prefix import Prefix, copy
@@ -262,6 +263,25 @@ def test_another_model_is_kept_in_the_log_and_so_is_the_one_before(tmp_path):
     assert difference(done, again).equal
     assert difference(again, on(again, 0.15).run.log).equal
     assert difference(pd, on(again, 0.05).run.log).equal
+
+
+def test_code_from_outside_goes_on_too_if_it_is_trusted(tmp_path):
+    (tmp_path / "laws.py").write_text(LAWS)
+    sets = [
+        f"controller={{kind: external, python: '{tmp_path}/laws.py:Remembers'}}",
+        f"imperfections.external=[{{python: '{tmp_path}/laws.py:Noisy'}}]",
+        "duration=1.1",
+    ]
+    log = run_logged(load_scenario("paper", sets, trust=True), tmp_path / "run.mcap").log
+    for at in (0.3, 1.05):
+        again = resume(log, at, out=tmp_path / "again.mcap", force=True, trust=True).run.log
+        assert difference(log, again).equal
+    with pytest.raises(ScenarioError, match=r"its scenario: controller\.python = .*--trust"):
+        resume(log, 0.3, ["controller={kind: pd}"])
+    other = "controller.settings={}"
+    assert resume(log, 0.3, [other], trust=True).told == ""
+    gone = resume(log, 0.3, ["imperfections.external=[]"], trust=True).run.trace
+    assert np.array_equal(gone["q_meas"][300:], gone["q"][300:])
 
 
 def test_a_torn_log_is_run_to_its_end(pd):
