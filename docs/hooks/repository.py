@@ -1,7 +1,8 @@
 """What stands outside of docs/, on the site: links work here and where Markdown is read as it is.
 
-CONTRIBUTING.md and CHANGELOG.md become pages. A line that is nothing but a link to a section of
-README.md becomes that section. What else is linked to outside of docs/ is copied under files/.
+CONTRIBUTING.md and CHANGELOG.md become pages, as notebooks do (notebooks.py). A line that is
+nothing but a link to a section of README.md becomes that section. What else is linked to outside of
+docs/ is copied under files/.
 """
 
 from __future__ import annotations
@@ -49,7 +50,12 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
 
 def _parts(markdown: str, page: File) -> Iterator[tuple[str, str]]:
     """A page's text and sections of README in it, each with the folder its links start from."""
-    own = "" if page.src_uri in PAGES.values() else posixpath.dirname(f"docs/{page.src_uri}")
+    if page.src_uri in PAGES.values():
+        own = ""
+    else:
+        own = posixpath.dirname(
+            page.src_uri if _is_notebook(page.src_uri) else f"docs/{page.src_uri}"
+        )
     for k, text in enumerate(SECTION.split(markdown)):
         yield (text, own) if k % 2 == 0 else (_section(text), "")
 
@@ -61,7 +67,13 @@ def _target(link: str, folder: str) -> tuple[str, Path | None]:
         return place.removeprefix("docs/"), None
     if place in {README, *PAGES}:
         return PAGES.get(place, "index.md"), None
+    if _is_notebook(place):
+        return posixpath.splitext(place)[0] + ".md", None
     return f"files/{place}", ROOT / place
+
+
+def _is_notebook(place: str) -> bool:
+    return posixpath.dirname(place) == "notebooks"
 
 
 def _section(anchor: str) -> str:

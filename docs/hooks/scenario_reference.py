@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from dnnmso_mj.loading import scenario_schema
-from dnnmso_mj.loading.shape import Shape
+from dnnmso_mj.loading.shape import ABSENT, Shape
 
 PLACE = "<!-- make docs: scenario -->"
 HEAD = "| key | meaning | allowed | unit | default |\n| --- | --- | --- | --- | --- |\n"
@@ -102,6 +102,8 @@ def _link(model: str) -> str:
 
 
 def _default(default: Any) -> str:
+    if default is ABSENT:
+        return ""
     if isinstance(default, list) and len(default) == 1:
         default = default[0]  # one number stands for all
     if isinstance(default, dict):
