@@ -48,7 +48,7 @@ schema: $(VENV)/.installed-run
 
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
-	@echo "site/index.html"
+	@echo "site/index.html; with its search: $(BIN)/python -m http.server --directory site --bind 127.0.0.1"
 
 build: $(VENV)/.installed-test
 	$(BIN)/python -m build --no-isolation

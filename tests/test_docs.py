@@ -126,6 +126,7 @@ def test_the_make_target_exists(command):
 def test_the_pages_python_runs(page, workplace, monkeypatch):
     """All blocks of a page, one after the other."""
     monkeypatch.chdir(workplace)
+    monkeypatch.syspath_prepend(workplace)  # as for a script that stands there
     names: dict[str, object] = {"__name__": "__page__"}
     for block in blocks(TEXTS[page], "python"):
         exec(compile(block, page, "exec"), names)
