@@ -36,7 +36,7 @@ def _reference() -> Iterator[str]:
         if names:
             yield f"## {key} {{ #{key} }}\n\n{value['description']}\n"
         for name in names:
-            yield _section(name, models[name], models)
+            yield _section(name, models, name in _models(value))
 
 
 def _nested(schema: Schema, models: Schema) -> list[str]:
@@ -51,9 +51,10 @@ def _models(schema: object) -> list[str]:
     return list(dict.fromkeys(re.findall(r"'#/\$defs/(\w+)'", repr(schema))))
 
 
-def _section(name: str, model: Schema, models: Schema) -> str:
+def _section(name: str, models: Schema, direct: bool) -> str:
+    model = models[name]
     kind = model["properties"].get("kind", {}).get("const")
-    title = f"`kind: {kind}`" if kind else name
+    title = f"`kind: {kind}`" if kind and direct else f"{name}, `kind: {kind}`" if kind else name
     said = model.get("description", "")
     return f"### {title} {{ #{name.lower()} }}\n\n{said}\n\n{_table(name.lower(), model, models)}"
 
