@@ -212,7 +212,7 @@ class Plant:
     Attributes:
         q, qd: joint angle (n,) rad and velocity (n,) rad/s: live, read-only views.
         applied: torque (n,) N·m on the joints beside the motors': live, held until changed.
-        model: MuJoCo's model, this plant's own.
+        model, data: MuJoCo's, this plant's own.
         view: the same robot for compiled code.
     """
 
@@ -223,7 +223,7 @@ class Plant:
                 f"initial.q has {scenario.n_joints} entries; allowed: {self.model.nv}, "
                 f"since plant.model = {scenario.plant.model} has {self.model.nv} joints"
             )
-        data = self._data = mujoco.MjData(self.model)
+        data = self.data = mujoco.MjData(self.model)
         self.q: Array = _read_only(data.qpos)
         self.qd: Array = _read_only(data.qvel)
         self.applied: Array = data.qfrc_applied
@@ -239,9 +239,9 @@ class Plant:
 
     def reset(self, q: Array, qd: Array) -> None:
         """Put the robot at q (n,) rad, q̇ (n,) rad/s, at time zero."""
-        mujoco.mj_resetData(self.model, self._data)
-        self._data.qpos[:] = q
-        self._data.qvel[:] = qd
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = q
+        self.data.qvel[:] = qd
 
     def damp(self, viscous: Array) -> None:
         """Give the joints viscous friction (n,) N·m·s/rad; every integrator takes it in."""

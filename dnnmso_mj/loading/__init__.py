@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from dnnmso_mj.paths import (
     shipped_controllers,
 )
 from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.scenario.tuned import TunedController
 from dnnmso_mj.wording import did_you_mean, show
 
 __all__ = [
@@ -123,10 +125,19 @@ def kind_set(kind: str) -> str:
     return f"controller={{kind: {kind}}}"
 
 
+@cache
 def controller_kinds() -> tuple[str, ...]:
-    """Every kind of controller."""
+    """Every kind of controller that its defaults alone make whole; a policy needs a file, say."""
     controller = Shape.root().child("controller")
-    return controller.choices if controller else ()
+    return tuple(filter(_stands_alone, controller.choices)) if controller else ()
+
+
+def _stands_alone(kind: str) -> bool:
+    try:
+        TunedController.model_validate({"controller": {"kind": kind}})
+    except ValidationError:
+        return False
+    return True
 
 
 def located(
