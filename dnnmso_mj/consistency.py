@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from dnnmso_mj.scenario.backstepping import Backstepping
 from dnnmso_mj.scenario.controller import effectiveness, inversion
+from dnnmso_mj.scenario.policy import Policy
 from dnnmso_mj.scenario.replay import DnnMsoReplay
 from dnnmso_mj.scenario.rivals import Rival
 
@@ -151,7 +152,7 @@ def _controller_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, 
                 yield f"{path}.effectiveness.{name}", len(values), {n}
     for path, K2 in _observer_gains(scenario):
         yield path, len(K2), {1, 2 * n}
-    if isinstance(controller, Rival | Backstepping):  # each of their gains is of a joint
+    if isinstance(controller, Rival | Backstepping | Policy):  # their lists are of joints
         yield from _numbers("controller", controller, n)
     for name, allowed in (("K_v", {1, n}), ("box", {1, 2 * n})):
         if hasattr(controller, name):

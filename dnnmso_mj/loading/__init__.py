@@ -19,9 +19,10 @@ from dnnmso_mj.loading.complaints import Complaint, complain, explain
 from dnnmso_mj.loading.documents import Node, Problem, read_document
 from dnnmso_mj.loading.overrides import Override, apply_overrides, parse_overrides
 from dnnmso_mj.loading.places import Places
+from dnnmso_mj.loading.relative import CONTROLLER, absolute, absolute_set, pin_policy
 from dnnmso_mj.loading.shape import Shape, lookup, scenario_schema
 from dnnmso_mj.loading.text import read_text
-from dnnmso_mj.loading.tuned import CONTROLLER, Graft, graft_file, graft_sets
+from dnnmso_mj.loading.tuned import Graft, graft_file, graft_sets
 from dnnmso_mj.paths import (
     find_controller,
     find_model,
@@ -80,6 +81,7 @@ def load_scenario(
     draft = _draft(source, overrides)
     data, places, complaints = draft.data, draft.places, draft.complaints
     complaints += _resolve_model(data, draft.file, places.sets)
+    pin_policy(data)
     scenario = None
     try:
         scenario = Scenario.model_validate(data)
@@ -183,11 +185,14 @@ def _draft(source: str | Path, overrides: Sequence[str]) -> _Draft:
         problems = problems or [_not_a_scenario(root)]
         raise ScenarioError(Places(file, root, sets).message(problems, []))
     sets, brought, complaints = graft_sets(sets)
+    sets = tuple(map(absolute_set, sets))
     data = root.plain()
     grafts: list[Graft] = []
     if not any(item.path == CONTROLLER for item in sets):
         grafts, more = graft_file(data, file.absolute().parent)
         complaints += more
+        if "controller" in data:
+            data["controller"] = absolute(data["controller"], file.absolute().parent)
     lost = bool(complaints)
     complaints += apply_overrides(data, sets)
     places = Places(file, root, sets, [*grafts, *brought])

@@ -24,6 +24,7 @@ _NOUNS = {
     "string": ("text", "texts"),
     "boolean": ("true or false", "true or false"),
     "null": ("null", "null"),
+    "object": ("a group of keys", "groups of keys"),
 }
 
 

@@ -14,6 +14,7 @@ from dnnmso_mj.scenario.inversion import Inversion
 from dnnmso_mj.scenario.learning import Network, Observer
 from dnnmso_mj.scenario.neural import LewisNn
 from dnnmso_mj.scenario.optimizers import ByMadam, Madam, Optimizer, Rule, check_resolvable, chosen
+from dnnmso_mj.scenario.policy import Policy
 from dnnmso_mj.scenario.replay import DnnMsoReplay
 from dnnmso_mj.scenario.rivals import Rival
 
@@ -131,6 +132,7 @@ Controller = Annotated[
     | Backstepping
     | SlotineLi
     | ConcurrentLearning
+    | Policy
     | Rival,
     Field(discriminator="kind"),
 ]
