@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from hashlib import sha256
 from pathlib import Path
@@ -141,7 +142,8 @@ def _torchscript(path: Path, name: str, zeros: Array, n_outputs: int) -> Act:
         ) from error
     torch.set_num_threads(1)  # a policy is small, and a sweep has a process on every core
     try:
-        module = torch.jit.load(str(path), map_location="cpu")  # type: ignore[no-untyped-call]
+        with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+            module = torch.jit.load(str(path), map_location="cpu")  # type: ignore[no-untyped-call]
     except (
         Exception
     ) as error:  # torch raises RuntimeError, and others for files that are no archive

@@ -9,6 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from dnnmso_mj.compile_loop import compile_halves_elsewhere
 from dnnmso_mj.controllers import Command, Inputs
 from dnnmso_mj.controllers.measured import empty_command, show_measured
 from dnnmso_mj.errors import DnnmsoError, NonFiniteError, ScenarioError
@@ -100,6 +101,7 @@ class Episode(Simulation):
         self._outside = FromOutside(scenario.n_joints)
         mjcf = Mjcf.read(find_model(scenario.plant.model))
         super().__init__(scenario, mjcf, controller=self._outside)
+        compile_halves_elsewhere(self.world, scenario, mjcf)
         self.over, self.error = True, ""
 
     @property

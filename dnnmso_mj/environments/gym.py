@@ -178,10 +178,11 @@ def _renderer(episode: Episode) -> Any:
         "azimuth": view.azimuth,
         "elevation": view.elevation,
     }
-    displays = {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"} & set(os.environ)
-    if sys.platform == "linux" and not displays:
-        os.environ["MUJOCO_GL"] = "egl"  # what MuJoCo takes by itself needs a display
+    told = {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"} & set(os.environ)
+    headless = sys.platform == "linux" and not told
     try:
+        if headless:
+            os.environ["MUJOCO_GL"] = "egl"  # what it takes by itself needs a display
         from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 
         renderer = MujocoRenderer(model, data, camera, *FRAME)
@@ -191,6 +192,9 @@ def _renderer(episode: Episode) -> Any:
             f"render_mode = rgb_array needs OpenGL: {type(error).__name__}: {error}; without a "
             "display set MUJOCO_GL=egl, and install libegl1 and libgl1-mesa-dri"
         ) from error
+    finally:
+        if headless:
+            del os.environ["MUJOCO_GL"]
     return renderer
 
 
