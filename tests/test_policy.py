@@ -226,9 +226,7 @@ def test_another_file_than_the_one_that_was_loaded_is_refused(laws, tmp_path):
     write_onnx(tmp_path / "law.onnx", weights())
     scenario = named(tmp_path, "law.onnx")
     write_onnx(tmp_path / "law.onnx", 2 * weights())
-    with pytest.raises(
-        ScenarioError, match=r"controller\.sha256 = .*; allowed: the file"
-    ):
+    with pytest.raises(ScenarioError, match=r"controller\.sha256 = .*; allowed: the file"):
         simulate(scenario)
 
 

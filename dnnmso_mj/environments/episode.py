@@ -95,8 +95,8 @@ class Episode(Simulation):
             scenario = load_scenario(scenario, sets)
         elif sets:
             raise ScenarioError(f"sets = {list(sets)}; allowed: none beside a loaded scenario")
-        each = tuple(np.ravel(scale).tolist()) if scale is not None else None
-        scenario = driven_from_outside(scenario, each)
+        each = None if scale is None else _positive(scale, scenario.n_joints)
+        scenario = _driven_from_outside(scenario, each)
         self.scale = torque_scale(scenario, each)
         self._outside = FromOutside(scenario.n_joints)
         mjcf = Mjcf.read(find_model(scenario.plant.model))
@@ -227,11 +227,20 @@ class Episode(Simulation):
         self._recorder.event(Event(t, "error", f"diverged: {self.error}"))
 
 
-def driven_from_outside(scenario: Scenario, scale: tuple[float, ...] | None) -> Scenario:
+def _driven_from_outside(scenario: Scenario, scale: tuple[float, ...] | None) -> Scenario:
     """The scenario with `outside` for its controller, so that nothing of its own one is left."""
     name = f"{outside.__module__}:{outside.__qualname__}"
     driver = Policy(kind="policy", python=name, torque_scale=scale)
-    return Scenario.model_validate(scenario.model_copy(update={"controller": driver}).model_dump())
+    return scenario.model_copy(update={"controller": driver})
+
+
+def _positive(scale: float | tuple[float, ...], n_joints: int) -> tuple[float, ...]:
+    values = np.ravel(np.array(scale, dtype=float))
+    if values.size not in {1, n_joints} or not (np.isfinite(values) & (values > 0.0)).all():
+        raise ScenarioError(
+            f"torque_scale = {scale}; allowed: a number > 0 (N·m), or {n_joints}, one a joint"
+        )
+    return tuple(values.tolist())
 
 
 def ticks_of(control_timestep: float | None, scenario: Scenario) -> int:

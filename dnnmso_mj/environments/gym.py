@@ -149,6 +149,7 @@ class TrackingEnv(gymnasium.Env[Array, Array], EzPickle):
         if self._renderer is None:
             self._renderer = _renderer(self.episode)
         self.episode.place()
+        self._renderer.viewer.make_context_current()  # another environment's may be
         image: Array = self._renderer.render("rgb_array")
         return image
 
