@@ -341,7 +341,7 @@ def test_both_can_be_drawn_and_dm_control_s_viewer_can_run_one():
 
 def test_what_no_environment_can_be_made_of_is_refused():
     for make in (TrackingEnv, dm.load):
-        with pytest.raises(ScenarioError, match="allowed: a multiple of dt = 0"):
+        with pytest.raises(ScenarioError, match="is no multiple of dt = 0"):
             make("paper", control_timestep=0.0015)
         with pytest.raises(ScenarioError, match=r"spread_q = -1; allowed: a number >= 0"):
             make("paper", spread_q=-1)

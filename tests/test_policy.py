@@ -10,7 +10,7 @@ import pytest
 from policy_samples import SCALE, weights, write_onnx, write_python, write_torchscript
 
 from dnnmso_mj.comparison.plan import plan_comparison
-from dnnmso_mj.controllers import build_controller
+from dnnmso_mj.controllers import Inputs, build_controller
 from dnnmso_mj.environments.episode import Episode
 from dnnmso_mj.environments.start import Start, episode_scenario
 from dnnmso_mj.errors import DnnmsoError, MissingExtraError, ScenarioError
@@ -76,15 +76,17 @@ def test_a_policy_in_single_precision_is_given_single_precision(laws, pd):
     assert 0 < np.abs(trace["q"] - pd["q"]).max() < 1e-5
 
 
-def test_it_sees_and_does_what_it_sees_and_does_in_an_environment(laws):
+@pytest.mark.parametrize("every", [1, 8])
+def test_it_sees_and_does_what_it_sees_and_does_in_an_environment(laws, every):
     from dnnmso_mj.importing import import_named
 
     law = import_named(f"{laws / 'laws.py'}:PdLaw", "x", "x")()
-    scenario = named(laws, "laws.py:PdLaw", scale=700.1)
+    held = f"controller.control_timestep={every * 0.001}"
+    scenario = named(laws, "laws.py:PdLaw", held, scale=700.1)
     episode = Episode(scenario, scale=700.1)
     episode.restart(episode_scenario(episode.scenario, scenario.seed, Start()))
     while not episode.over:
-        episode.hold(episode.torque(law(episode.observation())), 1)
+        episode.hold(episode.torque(law(episode.observation())), every)
     alone, driven = simulate(scenario), episode.trace()
     for name in set(alone) - {"compute_us"}:
         assert np.array_equal(alone[name], driven[name]), name
@@ -117,8 +119,11 @@ def test_what_a_policy_remembers_begins_anew_and_is_its_state(laws):
     trace = simulate(scenario)
     assert np.allclose(trace["tau_cmd"][:3, 0], [1.0, 2.0, 3.0])
     assert one.state()["ticks"].tolist() == [0]
-    two.restore({"ticks": np.array([41])})
-    assert two.state()["ticks"].tolist() == [41]
+    state = {"held": np.array([0]), "tau": np.zeros(2), "ticks": np.array([41])}
+    two.restore(state)
+    assert {name: value.tolist() for name, value in two.state().items()} == {
+        name: value.tolist() for name, value in state.items()
+    }
 
 
 def test_an_entry_point_names_a_policy_too(laws, tmp_path, monkeypatch, pd):
@@ -180,6 +185,17 @@ def test_it_is_no_kind_that_its_defaults_make_whole():
     assert "pd" in controller_kinds()
 
 
+def test_a_restored_controller_holds_on_to_its_action(laws):
+    scenario = named(laws, "laws.py:Counter", "controller.control_timestep=0.003", scale=1000.0)
+    arm, inputs = Mjcf.read(find_model("two_link")), Inputs.zeros(2)
+    one, two = build_controller(scenario, arm), build_controller(scenario, arm)
+    one.reset(np.zeros(4))
+    told = [one.update(inputs).tau[0] for _ in range(4)]
+    assert np.allclose(told, [1.0, 1.0, 1.0, 2.0])
+    two.restore(one.state())
+    assert np.allclose([two.update(inputs).tau[0] for _ in range(4)], [2.0, 2.0, 3.0, 3.0])
+
+
 # What is refused
 
 
@@ -210,6 +226,7 @@ def test_it_is_no_kind_that_its_defaults_make_whole():
         ("{python: 'laws.py:Forgets'}", "has state or restore alone; allowed: both, or none"),
         ("{python: 'laws.py:PdLaw', settings: {ki: 1}}", "cannot be called with settings {ki: 1}"),
         ("{python: nobody}", "no entry point of the group dnnmso_mj.policies"),
+        ("{file: law.pt, control_timestep: 0.0015}", "is no multiple of dt = 0.001 within"),
         ("{file: law.pt, torque_scale: [1, 2, 3]}", "torque_scale = [1, 2, 3]: has 3 entries"),
     ],
 )

@@ -158,6 +158,6 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
         SlotineLi: lambda: SlotineLiController(spec, dt, nominal),
         ConcurrentLearning: lambda: ConcurrentLearningController(spec, dt, nominal),
         NoNetwork: lambda: NoNetworkController(spec, n, dt, nominal),
-        Policy: lambda: PolicyController(spec, torque_scale(scenario, spec.torque_scale)),
+        Policy: lambda: PolicyController(spec, torque_scale(scenario, spec.torque_scale), dt),
     }
     return builders[type(spec)]()

@@ -18,6 +18,8 @@ from dnnmso_mj.scenario.policy import Policy
 
 Array = np.ndarray
 
+OWN = ("held", "tau")  # of the state; the rest is the policy's
+
 
 class PolicyController:
     """A policy; it runs tick by tick, not compiled.
@@ -25,6 +27,7 @@ class PolicyController:
     Args:
         spec: where the policy is.
         scale: torque (n,) N·m of an action of 1.
+        dt: control period (s).
 
     Raises:
         ScenarioError, MissingExtraError: as `LoadedPolicy`.
@@ -32,31 +35,41 @@ class PolicyController:
 
     n_layers = 0
 
-    def __init__(self, spec: Policy, scale: Array) -> None:
+    def __init__(self, spec: Policy, scale: Array, dt: float) -> None:
         n = scale.size
+        self._every = round((spec.control_timestep or dt) / dt)  # ticks
+        self._held = 0  # ticks that the action has been held
         self._scale = scale
         self._observation = np.zeros(len(PARTS) * n)
         self._command = empty_command(n)
         self._policy = LoadedPolicy(spec, self._observation.size, n)
 
     def reset(self, x: Array) -> None:
+        self._held = 0
         self._policy.reset()
 
     def update(self, inputs: Inputs) -> Command:
-        command = self._command
+        if self._held == 0:
+            self._act(inputs)
+        self._held = (self._held + 1) % self._every
+        show_measured(self._command, inputs.x)
+        return self._command
+
+    def _act(self, inputs: Inputs) -> None:
         observe(inputs, self._observation)
         action = self._policy(self._observation.copy())  # the policy may keep or change it
         if not np.isfinite(action).all():
             raise NonFiniteError("the policy's action", action.tolist())
-        torque(action, self._scale, command.tau)
-        show_measured(command, inputs.x)
-        return command
+        torque(action, self._scale, self._command.tau)
 
     def dynamics(self, x: Array) -> Array:
         return np.zeros(x.size // 2)
 
     def state(self) -> dict[str, Array]:
-        return self._policy.state()
+        own = {"held": np.array([self._held]), "tau": self._command.tau.copy()}
+        return own | self._policy.state()
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        self._policy.restore(state)
+        self._held = int(state["held"][0])
+        self._command.tau[:] = state["tau"]
+        self._policy.restore({name: state[name] for name in state if name not in OWN})

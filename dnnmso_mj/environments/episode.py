@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from dnnmso_mj.compile_loop import compile_halves_elsewhere
+from dnnmso_mj.consistency import MULTIPLE, is_multiple
 from dnnmso_mj.controllers import Command, Inputs
 from dnnmso_mj.controllers.measured import empty_command, show_measured
 from dnnmso_mj.errors import DnnmsoError, NonFiniteError, ScenarioError
@@ -21,8 +22,7 @@ from dnnmso_mj.observation import PARTS, observe, torque, torque_scale
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.reference import Reference
-from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.scenario.policy import Policy
+from dnnmso_mj.scenario import Policy, Scenario
 from dnnmso_mj.simulate import CHUNK, Simulation
 from dnnmso_mj.tick import ROWS, RUNNING, STATUS, begin_tick, end_tick
 from dnnmso_mj.trace import Event, RunInfo, Trace
@@ -251,10 +251,7 @@ def ticks_of(control_timestep: float | None, scenario: Scenario) -> int:
     """
     if control_timestep is None:
         return 1
-    steps = control_timestep / scenario.dt
-    if not 0.5 < steps < scenario.n_ticks + 0.5 or abs(steps - round(steps)) > 1e-6:
-        raise ScenarioError(
-            f"control_timestep = {control_timestep}; allowed: a multiple of dt = {scenario.dt}, "
-            f"at most the duration of {scenario.duration:g} s"
-        )
-    return round(steps)
+    if not is_multiple(control_timestep, scenario):
+        problem = f"is no {MULTIPLE.format(scenario.dt)}"
+        raise ScenarioError(f"control_timestep = {control_timestep}: {problem}")
+    return round(control_timestep / scenario.dt)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, JsonValue, model_validator
 
-from dnnmso_mj.scenario.fields import PositiveEach, Strict, refusal
+from dnnmso_mj.scenario.fields import Positive, PositiveEach, Strict, refusal
 
 TORCHSCRIPT = (".pt", ".ts")
 ONNX = (".onnx",)
@@ -27,6 +27,8 @@ class Policy(Strict):
     called with `settings`, it gives what is called with an observation and gives an action."""
     settings: dict[str, JsonValue] = Field(default={})
     """Keyword arguments for `python`."""
+    control_timestep: Positive | None = None
+    """How long an action is held (s), a multiple of dt; null: dt."""
     torque_scale: PositiveEach | None = None
     """Torque of action 1 (N·m), each; null: imperfections.torque_limit, or 128 without one."""
 
