@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dnnmso_mj.errors import MissingExtraError, ScenarioError
-from dnnmso_mj.importing import import_named
+from dnnmso_mj.external import called, import_callable, told
+from dnnmso_mj.files import digest
 from dnnmso_mj.scenario.policy import ONNX, Policy
 from dnnmso_mj.wording import clean, show
 
@@ -54,12 +54,11 @@ class LoadedPolicy:
         """The action (n,) of an observation (k,).
 
         Raises:
-            ScenarioError: the policy fails, or gives something else.
+            ExternalError: the policy fails.
+            ScenarioError: it gives something else.
         """
-        try:
+        with called(f"{self.name}: an observation of shape ({observation.size},)"):
             action = np.asarray(self._act(observation), dtype=float)
-        except Exception as error:  # whatever foreign code raises
-            raise _refused(self.name, observation.size, error) from error
         if action.shape != (self.n_outputs,):
             raise ScenarioError(
                 f"{self.name}: gives an action of shape {action.shape}; allowed: "
@@ -82,11 +81,6 @@ class LoadedPolicy:
             self._owner.restore(state)
 
 
-def digest(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    return sha256(path.read_bytes()).hexdigest()
-
-
 def _found(spec: Policy, name: str) -> Path:
     path = Path(spec.file or "")
     try:
@@ -104,24 +98,13 @@ def _found(spec: Policy, name: str) -> Path:
     return path
 
 
-def _refused(name: str, size: int, error: Exception) -> ScenarioError:
-    told = " ".join(clean(str(error)).split())[:300]
-    return ScenarioError(
-        f"{name}: fails on an observation of shape ({size},): {type(error).__name__}: {told}"
-    )
-
-
 def _python(spec: Policy, name: str) -> Act:
-    made: Any = import_named(spec.python or "", "controller.python", GROUP)
+    made = import_callable(spec.python or "", "controller.python", GROUP)
     settings = f" with settings {show(spec.settings)}" if spec.settings else " without settings"
-    if not callable(made):
-        raise ScenarioError(f"{name}: is a {type(made).__name__}; allowed: a class or a function")
     try:
         policy = made(**spec.settings)
     except Exception as error:  # whatever foreign code raises
-        raise ScenarioError(
-            f"{name}: cannot be called{settings}: {type(error).__name__}: {error}"
-        ) from error
+        raise ScenarioError(f"{name}: cannot be called{settings}: {told(error)}") from error
     if not callable(policy):
         raise ScenarioError(
             f"{name}: called{settings} it gives a {type(policy).__name__}; allowed: what can be "

@@ -19,7 +19,7 @@ from dnnmso_mj.realtime import left_in_peace, real_time_pace
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulate import AS_FAST_AS_CAN_BE, Progress, Simulation
+from dnnmso_mj.simulation import AS_FAST_AS_CAN_BE, Progress, Simulation
 from dnnmso_mj.trace import Event, RunInfo, Trace
 
 MAX_NUMBERED = 10_000

@@ -19,7 +19,7 @@ from dnnmso_mj.run import run_logged
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scenario.controller import inversion
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulate import Simulation
+from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.trace import Trace
 
 KINDS = pytest.mark.parametrize("kind", controller_kinds())

@@ -15,7 +15,6 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from dnnmso_mj import __version__
 from dnnmso_mj.cli import (
     audit,
     bench,
@@ -131,6 +130,8 @@ class _Warnings:
 
 def _print_version(wanted: bool) -> None:
     if wanted:
+        from dnnmso_mj import __version__
+
         print(__version__)
         raise typer.Exit
 

@@ -14,6 +14,7 @@ from dnnmso_mj.cli.shared import (
     DIVERGED,
     Json,
     Overrides,
+    Trust,
     near,
     number,
     print_table,
@@ -53,6 +54,7 @@ def run(
         bool, typer.Option("--real-time", help="Keep to the wall clock, one tick each dt.")
     ] = False,
     plot: Annotated[bool, typer.Option(help="Draw the figures beside the log.")] = True,
+    trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Run a scenario headless: log, figures, summary."""
@@ -61,7 +63,7 @@ def run(
     from dnnmso_mj.timing import timing
 
     sets = [*(overrides or []), *([] if seed is None else [f"seed={seed}"])]
-    loaded = load_scenario(scenario, sets)
+    loaded = load_scenario(scenario, sets, trust=trust)
     try:
         with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
             done = run_logged(loaded, out, force=force, real_time=real_time, progress=progress)

@@ -13,7 +13,7 @@ import typer
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dnnmso_mj.simulate import Progress
+    from dnnmso_mj.simulation import Progress
     from dnnmso_mj.sweep.statistics import Spread
 
 DIVERGED = 1
@@ -28,6 +28,9 @@ Force = Annotated[bool, typer.Option(help="Start anew whatever is there.")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change a key, e.g. plant.gravity=1.62."),
+]
+Trust = Annotated[
+    bool, typer.Option("--trust", help="Run code that the scenario names (keys `python`).")
 ]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
 

@@ -14,6 +14,7 @@ from dnnmso_mj.consistency import MULTIPLE, is_multiple
 from dnnmso_mj.controllers import Command, Inputs
 from dnnmso_mj.controllers.measured import empty_command, show_measured
 from dnnmso_mj.errors import DnnmsoError, NonFiniteError, ScenarioError
+from dnnmso_mj.external.imperfection import Hooks
 from dnnmso_mj.imperfections.sensors import SensorBank
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK, MemoryRecorder
@@ -23,7 +24,7 @@ from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.reference import Reference
 from dnnmso_mj.scenario import Policy, Scenario
-from dnnmso_mj.simulate import CHUNK, Simulation
+from dnnmso_mj.simulation import CHUNK, Simulation
 from dnnmso_mj.tick import ROWS, RUNNING, STATUS, begin_tick, end_tick
 from dnnmso_mj.trace import Event, RunInfo, Trace
 
@@ -99,9 +100,9 @@ class Episode(Simulation):
         scenario = _driven_from_outside(scenario, each)
         self.scale = torque_scale(scenario, each)
         self._outside = FromOutside(scenario.n_joints)
-        mjcf = Mjcf.read(find_model(scenario.plant.model))
-        super().__init__(scenario, mjcf, controller=self._outside)
-        compile_halves_elsewhere(self.world, scenario, mjcf)
+        self._model = Mjcf.read(find_model(scenario.plant.model))
+        super().__init__(scenario, self._model, controller=self._outside)
+        compile_halves_elsewhere(self.world, scenario, self._model)
         self.over, self.error = True, ""
 
     @property
@@ -117,15 +118,19 @@ class Episode(Simulation):
                 reference alone: see `start.episode_scenario`.
         """
         self.scenario, n = scenario, scenario.n_joints
-        self.reference = Reference(scenario.reference, n)
+        self.reference = Reference(scenario.reference, n, scenario.duration)
+        if self.hooks:
+            self.hooks = Hooks(scenario, self._model)
         sensors = SensorBank(scenario.imperfections, n, scenario.dt, scenario.seed, CHUNK)
-        self._sensors, self.world = sensors, self.world._replace(sensors=sensors.view)
+        perfect = sensors.view.perfect and not self.hooks
+        self.world = self.world._replace(sensors=sensors.view._replace(perfect=perfect))
+        self._sensors = sensors
         self._recorder = MemoryRecorder(self.layout, scenario.n_ticks)
         self.over, self.error = False, ""
         self._began, self._tick = time.perf_counter(), 0
         self._start()
         self._open_block()
-        begin_tick(self.world, 0)
+        self._tell()
 
     def observation(self) -> Array:
         """What is told of the present tick: a new vector (6n,); see `observation`."""
@@ -190,18 +195,32 @@ class Episode(Simulation):
 
     def _advance(self, tau: Array) -> None:
         """One tick from its command on, and the next one up to what is told of it."""
-        command = self._outside.update(self.world.inputs)
-        command.tau[:] = tau
-        if end_tick(self.world, command, self._tick):
+        self._command = self._outside.update(self.world.inputs)
+        self._command.tau[:] = tau
+        try:
+            if self._end():
+                self._close_block()
+                self._end_early(self._why_it_ended())
+                return
+            self._tick += 1
+            self.over = self._tick == self.scenario.n_ticks
+            if self._tick == self._block_end:
+                self._close_block()
+                self._open_block()
+            self._tell()
+        except NonFiniteError as error:  # of an imperfection from outside
             self._close_block()
-            self._end_early(self._why_it_ended())
-            return
-        self._tick += 1
-        self.over = self._tick == self.scenario.n_ticks
-        if self._tick == self._block_end:
-            self._close_block()
-            self._open_block()
+            self._end_early(error)
+
+    def _end(self) -> bool:
+        if self.hooks:
+            return self._end_hooked(self._tick)
+        return bool(end_tick(self.world, self._command, self._tick))
+
+    def _tell(self) -> None:
+        """What the sensors and the reference say of the present tick."""
         begin_tick(self.world, self._tick)
+        self.hooks.sense(self.t, self.world.inputs.x)
 
     def _open_block(self) -> None:
         """Rows are kept block by block, as `Simulation.run` does; what is due now happens."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, JsonValue, model_validator
+from pydantic import Field, model_validator
 
+from dnnmso_mj.scenario.external import Python, Settings
 from dnnmso_mj.scenario.fields import Positive, PositiveEach, Strict, refusal
 
 TORCHSCRIPT = (".pt", ".ts")
@@ -22,10 +23,10 @@ class Policy(Strict):
     """TorchScript (.pt, .ts) or ONNX (.onnx), relative to the file that names it."""
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
     """SHA-256 of that file, filled in when the scenario is loaded; another file is refused."""
-    python: str | None = None
+    python: Python | None = None
     """module:Name or file.py:Name of a class or function, or an entry point of dnnmso_mj.policies;
     called with `settings`, it gives what is called with an observation and gives an action."""
-    settings: dict[str, JsonValue] = Field(default={})
+    settings: Settings = Field(default_factory=dict)
     """Keyword arguments for `python`."""
     control_timestep: Positive | None = None
     """How long an action is held (s), a multiple of dt; null: dt."""

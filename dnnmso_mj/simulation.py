@@ -23,6 +23,7 @@ from dnnmso_mj.controllers import (
     compiled_ticks,
 )
 from dnnmso_mj.errors import NonFiniteError
+from dnnmso_mj.external.imperfection import Hooks
 from dnnmso_mj.imperfections.actuators import build_actuators, start_actuators
 from dnnmso_mj.imperfections.loads import Loads, build_loads, start_loads
 from dnnmso_mj.imperfections.sensors import SensorBank, sense
@@ -108,7 +109,8 @@ class Simulation:
         n, dt = scenario.n_joints, scenario.dt
         self.scenario = scenario
         self.plant = Plant(scenario, mjcf)
-        self.reference = Reference(scenario.reference, n)
+        self.reference = Reference(scenario.reference, n, scenario.duration)
+        self.hooks = Hooks(scenario, mjcf)
         self._mjcf = None if controller else mjcf  # what the controller can be made of again
         self.controller = controller or build_controller(scenario, mjcf, watch=watch)
         self.layout = StepLayout(n, self.controller.n_layers)
@@ -131,7 +133,9 @@ class Simulation:
         x, x_ref, xd_ref, e_track, f_true, f_err = np.zeros((6, 2 * n))
         return World(
             plant=self.plant.view,
-            sensors=self._sensors.view,
+            sensors=self._sensors.view._replace(perfect=False)
+            if self.hooks
+            else self._sensors.view,
             actuators=build_actuators(scenario.imperfections, n, dt),
             loads=loads,
             bounds=build_bounds(law, n, dt, first_order=first_order),
@@ -170,7 +174,7 @@ class Simulation:
         """
         status, reason = "ok", ""
         self._tick = 0
-        self._ticks = compiled_ticks(self.controller)
+        self._ticks = None if self.hooks else compiled_ticks(self.controller)
         self._prepare()
         started = time.perf_counter()
         try:
@@ -226,7 +230,10 @@ class Simulation:
         self._happened = 0
         world.counts[:] = 0
         self._begin_chunk(0)
-        self.controller.reset(self._first_reading(x))
+        self.hooks.start()
+        first = self._first_reading(x)
+        self.hooks.start()
+        self.controller.reset(first)
         self._flags = dict.fromkeys(CHANGES, False)
 
     def _first_reading(self, x: Array) -> Array:
@@ -234,6 +241,7 @@ class Simulation:
         reading = x.copy()
         if not self._sensors.view.perfect:
             sense(self._sensors.view, x, 0, 0, reading)
+        self.hooks.sense(0.0, reading)
         return reading
 
     def _loop(self, recorder: Recorder, progress: Progress | None) -> None:
@@ -298,14 +306,25 @@ class Simulation:
             raise self._why_it_ended()
 
     def _run_interpreted(self, first: int, count: int) -> None:
-        world = self.world
+        world, hooks = self.world, self.hooks
         for k in range(first, first + count):
-            if begin_tick(world, k):
+            in_time = begin_tick(world, k)
+            hooks.sense(k * world.dt, world.inputs.x)
+            if in_time:
                 began = time.perf_counter_ns()
                 self._command = self.controller.update(world.inputs)
                 world.counts[TOOK_NS] = time.perf_counter_ns() - began
-            if end_tick(world, self._command, k):
+            if self._end_hooked(k) if hooks else end_tick(world, self._command, k):
                 return
+
+    def _end_hooked(self, k: int) -> bool:
+        """End tick k with what imperfections from outside make of the command; log the command."""
+        world, asked, row = self.world, self._command.tau, self.world.counts[ROWS]
+        given = self._command._replace(tau=self.hooks.actuate(k * world.dt, asked))
+        ended = bool(end_tick(world, given, k))
+        if world.counts[ROWS] > row:
+            world.rows[row, self.layout.slices["tau_cmd"]] = asked
+        return ended
 
     def _why_it_ended(self) -> NonFiniteError:
         """The quantity that a tick found wrong, and its value."""
