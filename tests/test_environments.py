@@ -111,6 +111,31 @@ def test_dm_control_s_episode_is_the_run_of_the_same_torques_bit_for_bit(pd_run)
     assert env.task.metrics["rmse"] == compute_metrics(pd_run)["rmse"]
 
 
+OUTSIDE_HOOKS = """
+class Worn:
+    def __init__(self, setup):
+        self.rng = setup.rng
+
+    def sense(self, t, x):
+        return x + 1e-3 * self.rng.standard_normal(x.size)
+
+    def actuate(self, t, tau):
+        return 0.9 * tau
+"""
+
+
+def test_imperfections_from_outside_act_in_an_environment_too(tmp_path):
+    (tmp_path / "worn.py").write_text(OUTSIDE_HOOKS)
+    sets = ["duration=0.2", f"imperfections.external=[{{python: '{tmp_path}/worn.py:Worn'}}]"]
+    scenario = load_scenario("paper", sets, controller="pd", trust=True)
+    env = TrackingEnv(scenario, torque_scale=SCALE)
+    for seed in (1, 4):
+        run = simulate(scenario.model_copy(update={"seed": seed}))
+        assert np.allclose(run["tau"], 0.9 * run["tau_cmd"])
+        play(env, pd_law(), seed=seed)
+        check_same(env.trace(), run)
+
+
 @QUIET
 def test_both_show_and_reward_the_same(pd_run):
     env, other = TrackingEnv("paper", SETS), dm.load("paper", (*SETS, "seed=3"))
