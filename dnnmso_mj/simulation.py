@@ -182,7 +182,7 @@ class Simulation:
         except NonFiniteError as error:
             t = self._tick * self.scenario.dt
             state = self.controller.state()
-            causes = [name for name, values in state.items() if not np.isfinite(values).all()]
+            causes = [name for name, values in state.items() if not _finite(values)]
             cause = f" with {', '.join(causes)} not finite" if causes else ""
             status, reason = "diverged", f"{error}{cause} at t = {t:.6g} s"
             recorder.event(Event(t, "error", f"diverged: {reason}"))
@@ -357,6 +357,11 @@ class Simulation:
             for i in np.flatnonzero(flag != before):
                 level, what = ("warning", begins) if flag[i] else ("info", ends)
                 recorder.event(Event(float(rows[i, 0]), level, what))
+
+
+def _finite(values: Array) -> bool:
+    """Whether all numbers are finite; texts are."""
+    return values.dtype.kind in "SU" or bool(np.isfinite(values).all())
 
 
 def simulate(scenario: Scenario, mjcf: Mjcf | None = None, *, watch: bool = True) -> Trace:

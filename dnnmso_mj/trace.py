@@ -138,7 +138,7 @@ class Trace:
     >>> trace.table().column_names[:5]
     ['t', 'q1', 'q2', 'qd1', 'qd2']
     >>> round(trace.metrics["tau_peak"])
-    253
+    287
     """
 
     columns: Mapping[str, Array]
