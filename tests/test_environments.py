@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes.util
 import os
 import pickle
 import subprocess
@@ -352,6 +353,10 @@ assert environment.physics.named.data.xpos["link2"].any()
 """
 
 
+@pytest.mark.skipif(
+    ctypes.util.find_library("EGL") is None,
+    reason="no EGL: apt-get install libegl1 libgl1-mesa-dri",
+)
 def test_both_can_be_drawn_and_dm_control_s_viewer_can_run_one():
     env = os.environ | {"MUJOCO_GL": "egl"}
     done = subprocess.run(
