@@ -15,13 +15,14 @@ from dnnmso_mj.environments.episode import Episode
 from dnnmso_mj.environments.start import Start, episode_scenario
 from dnnmso_mj.errors import DnnmsoError, MissingExtraError, ScenarioError
 from dnnmso_mj.loading import controller_kinds, load_scenario
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.observation import torque_scale
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.reading import read_trace
 from dnnmso_mj.run import run_logged
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulation import simulate
+from dnnmso_mj.simulation import Simulation, simulate
 from dnnmso_mj.sweep.local import LocalEngine
 from dnnmso_mj.sweep.run import run_sweep
 
@@ -194,6 +195,18 @@ def test_a_restored_controller_holds_on_to_its_action(laws):
     assert np.allclose(told, [1.0, 1.0, 1.0, 2.0])
     two.restore(one.state())
     assert np.allclose([two.update(inputs).tau[0] for _ in range(4)], [2.0, 2.0, 3.0, 3.0])
+
+
+def test_a_run_goes_on_from_the_middle_as_it_was(laws):
+    scenario = named(laws, "laws.py:Counter", "controller.control_timestep=0.003", scale=90.0)
+    arm, whole = Mjcf.read(find_model("two_link")), simulate(scenario)
+    first = Simulation(scenario, arm)
+    first.run(MemoryRecorder(first.layout, scenario.n_ticks), until=401)
+    second = Simulation(scenario, arm)
+    recorder = MemoryRecorder(second.layout, scenario.n_ticks)
+    rest = recorder.trace(scenario, second.run(recorder, start=first.state()))
+    for name in ("q", "qd_meas", "tau_cmd", "tau"):
+        assert np.array_equal(rest[name], whole[name][401:]), name
 
 
 # What is refused

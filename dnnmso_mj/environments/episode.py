@@ -24,9 +24,10 @@ from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.reference import Reference
 from dnnmso_mj.scenario import Policy, Scenario
-from dnnmso_mj.simulation import CHUNK, Simulation
+from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.tick import ROWS, RUNNING, STATUS, begin_tick, end_tick
 from dnnmso_mj.trace import Event, RunInfo, Trace
+from dnnmso_mj.world import CHUNK
 
 Array = np.ndarray
 
