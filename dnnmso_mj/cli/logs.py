@@ -83,6 +83,7 @@ def info(log: Log, as_json: Json = False) -> None:
         "attachments": f"{len(found.attachments)} ({sum(found.attachments.values()) / 1e6:.2f} MB)",
         "versions": listing(found.versions),
         "commit": found.git_commit or "unknown",
+        **({"resumed": listing(found.resumed)} if found.resumed else {}),
     }
     for name, value in rows.items():
         table.add_row(name, str(value))

@@ -72,9 +72,11 @@ def resume(
         }))  # fmt: skip
     else:
         print_summary(trace, done.run.log, figures, since=done.tick)
-        print(f"resumed  {near(log)} at {t:g} s; {done.checked} ticks before that are as computed")
+        print(
+            f"resumed  {near(log)} at {t:g} s; the {done.checked} ticks before were computed again"
+        )
         if done.told:
-            print(f"changed  {done.told}")
+            print(f"branch   {done.told}")
     if undrawn is not None:
         raise undrawn
     if info.status == "diverged":
