@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 import pyarrow as pa
@@ -25,9 +25,7 @@ UNITS = {
     "qd_ref": "rad/s",
     "tau_cmd": "N·m",
     "tau": "N·m",
-    "lyapunov": "rad² + rad²/s²",
     "ultimate_bound": "rad",
-    "ultimate_bound_paper": "1",
     "compute_us": "µs",
     "wake_late_us": "µs",
 }
@@ -62,10 +60,12 @@ def trace_table(trace: Trace) -> pa.Table:
 
 def trace_frame(trace: Trace) -> pd.DataFrame:
     """The columns of a trace as `Trace.to_pandas` has them."""
-    if find_spec("pandas") is None:
+    try:
+        import_module("pandas")
+    except ModuleNotFoundError as error:
         raise MissingExtraError(
             "a data frame needs pandas, which is not installed: pip install pandas"
-        )
+        ) from error
     frame: pd.DataFrame = trace_table(trace).to_pandas()
     return frame.set_index("t")
 

@@ -34,6 +34,8 @@ from dnnmso_mj.sweep.local import LocalEngine
 from dnnmso_mj.sweep.plan import plan_sweep
 from dnnmso_mj.sweep.run import run_sweep
 from dnnmso_mj.trace import Trace
+from dnnmso_mj.tuning import TuneError
+from dnnmso_mj.tuning.search import Request, Search
 
 CLOCKED = {"compute_us"}
 SHORT = "duration=0.3"
@@ -154,6 +156,13 @@ def test_a_torque_that_is_not_finite_ends_the_run(laws):
 def test_a_kind_that_needs_code_is_not_among_those_that_stand_alone():
     assert "external" not in controller_kinds()
     assert {"pd", "dnn_mso"} <= set(controller_kinds())
+
+
+def test_tuning_one_is_refused_with_what_can_be_tuned(laws):
+    Path("mine.yaml").write_text("controller: {kind: external, python: 'laws.py:Pd'}\n")
+    request = Request("paper", "mine.yaml", seeds=[0], trials=2, trust=True)
+    with pytest.raises(TuneError, match=r"kind = external: nothing of it is tuned; allowed: dnn"):
+        Search(request)
 
 
 # --- trust ------------------------------------------------------------------------------------
@@ -451,6 +460,19 @@ def test_workers_of_a_sweep_import_it_too(laws, package):
     assert table["status"] == ["ok"] * 4, table["reason"]
     alone = simulate(plan.points[0].scenario)
     assert table["rmse"][0] == alone.metrics["rmse"]
+
+
+def test_a_sweep_does_not_go_on_with_other_code(laws, package):
+    sets = [SHORT, "controller={kind: external, python: 'laws.py:Pd'}"]
+    sets += ["imperfections.external=[{python: outside_off}]"]
+    before = plan_sweep("paper", [0], sets, trust=True).definition()
+    assert before == plan_sweep("paper", [0], sets, trust=True).definition()
+    for file in (laws / "laws.py", package / "outside_package" / "laws.py"):
+        file.write_text(LAWS + "\n")
+        after = plan_sweep("paper", [0], sets, trust=True).definition()
+        assert set(before["outside"]) == set(after["outside"])
+        assert before["outside"] != after["outside"]
+        before = after
 
 
 def test_a_run_by_the_command_line_is_the_library_s(laws, package):

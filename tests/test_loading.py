@@ -210,7 +210,7 @@ REFUSED = {
     "unknown kind": (
         "",
         '3: reference.kind = "sinusiod": is none of the choices; allowed: one of: '
-        "exp_sinusoid, setpoint, sinusoid, waypoints; did you mean 'sinusoid'?",
+        "exp_sinusoid, external, setpoint, sinusoid, waypoints; did you mean 'sinusoid'?",
     ),
     "no kind": (
         "",

@@ -45,17 +45,22 @@ def absolute(name: Any, folder: Path) -> Any:
     return f"{folder.absolute() / where}:{attribute}"
 
 
-def import_paths(data: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, str]]:
-    """Every import path in some data, and the key path that holds it."""
+def named_code(data: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, str]]:
+    """Every name of code in some data, and the key path that holds it."""
     if isinstance(data, dict):
         for key, value in data.items():
-            if key == PYTHON and isinstance(value, str) and is_import_path(value):
+            if key == PYTHON and isinstance(value, str):
                 yield (*path, key), value
             else:
-                yield from import_paths(value, (*path, key))
+                yield from named_code(value, (*path, key))
     elif isinstance(data, list | tuple):
         for k, value in enumerate(data):
-            yield from import_paths(value, (*path, k))
+            yield from named_code(value, (*path, k))
+
+
+def import_paths(data: Any) -> Iterator[tuple[KeyPath, str]]:
+    """Every import path in some data, and the key path that holds it."""
+    return ((path, name) for path, name in named_code(data) if is_import_path(name))
 
 
 def require_trust(scenario: Scenario, where: str) -> None:

@@ -95,7 +95,7 @@ class MarginPlan:
             "precision": PRECISION,
             "scenarios": scenarios,
             "models": {c.scenario.plant.model: c.mjcf.text for c in self.points},
-            **code_identity(),
+            **code_identity(self.controllers.values()),
         }
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dnnmso_mj.errors import DnnmsoError, ScenarioError
+from dnnmso_mj.external.identity import code_digests
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.loading.overrides import Override, parse_overrides
 from dnnmso_mj.paths import find_model
@@ -100,14 +101,15 @@ class Plan:
         return {
             "points": points,
             "models": {p.scenario.plant.model: p.mjcf.text for p in self.points},
-            **code_identity(),
+            **code_identity(point.scenario for point in self.points),
         }
 
 
-def code_identity() -> dict[str, Any]:
-    """Which code the numbers of this installation come from."""
-    versions = software_versions()
+def code_identity(scenarios: Iterable[Scenario]) -> dict[str, Any]:
+    """Which code the numbers of these scenarios come from, here."""
+    versions, outside = software_versions(), code_digests(scenarios)
     return {
+        **({"outside": outside} if outside else {}),
         "versions": {name: versions[name] for name in NUMBERS_DEPEND_ON},
         "git_commit": git_commit(),
         "source_sha256": sources_digest(),

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dnnmso_mj import __version__
+from dnnmso_mj.external.identity import code_digests
 from dnnmso_mj.loading import controller_kinds, controller_set, kind_set, load_scenario
 from dnnmso_mj.loading.overrides import parse_overrides
 from dnnmso_mj.loading.shape import lookup
@@ -115,6 +116,7 @@ class Search:
             "model": self._point.mjcf.text,
             "versions": {name: versions[name] for name in NUMBERS_DEPEND_ON},
             "source_sha256": sources_digest(),
+            **({"outside": outside} if (outside := code_digests([self.scenario])) else {}),
         }
 
     def record(self, study: str, value: float) -> Tuning:
