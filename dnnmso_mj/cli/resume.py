@@ -26,6 +26,7 @@ from dnnmso_mj.wording import show
 
 if TYPE_CHECKING:
     from dnnmso_mj.difference import Difference, Place
+    from dnnmso_mj.resume import Resumed
 
 DIFFERENT = 1
 MOST_TOLD = 20  # events, or snapshots
@@ -52,36 +53,43 @@ def resume(
             done = resume_log(log, at, sets, out, force=force, trust=trust, progress=progress)
     except RunInterrupted as stop:
         raise KeyboardInterrupt(f"log: {near(stop.log)} ({stop.ticks} ticks)") from stop
-    trace, info = done.run.trace, done.run.trace.info
     figures, undrawn = draw(done.run) if plot else ([], None)
+    _tell(done, log, sets, figures, as_json=as_json)
+    info = done.run.trace.info
+    if undrawn is not None:
+        raise undrawn
+    if info.status == "diverged":
+        print(f"diverged: {info.reason}", file=sys.stderr)
+        raise typer.Exit(DIVERGED)
+
+
+def _tell(
+    done: Resumed, source: Path, sets: list[str], figures: list[Path], *, as_json: bool
+) -> None:
+    trace, info = done.run.trace, done.run.trace.info
     t = done.tick * trace.scenario.dt
     if as_json:
         print(json.dumps({
             "status": info.status,
             "reason": info.reason,
             "scenario": trace.scenario.name,
-            "source": str(log),
+            "source": str(source),
             "at": t,
             "checked_ticks": done.checked,
-            "changed": list(sets),
+            "changed": sets,
             "log": str(done.run.log),
             "figures": [str(figure) for figure in figures],
             "seed": info.seed,
             "wall_s": info.wall_s,
             "metrics": dict(info.metrics),
         }))  # fmt: skip
-    else:
-        print_summary(trace, done.run.log, figures, since=done.tick)
-        print(
-            f"resumed  {near(log)} at {t:g} s; the {done.checked} ticks before were computed again"
-        )
-        if done.told:
-            print(f"branch   {done.told}")
-    if undrawn is not None:
-        raise undrawn
-    if info.status == "diverged":
-        print(f"diverged: {info.reason}", file=sys.stderr)
-        raise typer.Exit(DIVERGED)
+        return
+    print_summary(trace, done.run.log, figures, since=done.tick)
+    print(
+        f"resumed  {near(source)} at {t:g} s; the {done.checked} ticks before were computed again"
+    )
+    if done.told:
+        print(f"branch   {done.told}")
 
 
 def diff(
