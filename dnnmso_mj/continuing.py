@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -40,6 +40,7 @@ class Continuation:
     Args:
         source: the log.
         tick: of it, to go on from.
+        events: of ticks before that; a torn log may have lost the last ones.
         last: the segment to go on with.
         state: to go on in; None: at the start.
         simulation, model: of that segment.
@@ -47,6 +48,7 @@ class Continuation:
 
     source: Recorded
     tick: int
+    events: Sequence[Event]
     last: Segment
     state: State | None
     simulation: Simulation
@@ -66,7 +68,8 @@ class Continuation:
         ) as recorder:
 
             def run() -> RunInfo:
-                _copy_before(self.source, self.tick, _Widened(recorder, theirs, layout))
+                before = _Widened(recorder, theirs, layout)
+                _copy_before(self.source, self.tick, self.events, before)
                 return self._go_on(_Widened(recorder, ours, layout), progress)
 
             return run_to_end(run, recorder, scenario, layout)
@@ -95,11 +98,13 @@ class Continuation:
         return [*segments, replace(self.last, model=MODEL)] if segments else [], files
 
 
-def _copy_before(source: Recorded, tick: int, recorder: Recorder) -> None:
-    """Rows, events and snapshots before a tick, in their order."""
+def _copy_before(source: Recorded, tick: int, events: Sequence[Event], recorder: Recorder) -> None:
+    """Rows, events and snapshots before a tick, in their order; those of `events` that it lacks."""
     dt, rows = source.trace.scenario.dt, source.layout.rows(source.trace.columns)[:tick]
     marks: list[tuple[int, Callable[[], None]]] = []
-    for event in source.trace.events:
+    known = {(round(event.t / dt), event.message) for event in source.trace.events}
+    lost = [event for event in events if (round(event.t / dt), event.message) not in known]
+    for event in [*source.trace.events, *lost]:
         marks.append((round(event.t / dt), partial(recorder.event, event)))
     for k, name in source.snapshots:
         arrays = source.arrays(k, name)

@@ -107,14 +107,14 @@ def _prepare(
     same = scenario.plant.model == segment.scenario.plant.model
     model = own if same else _model_file(scenario.plant.model)
     simulation = Simulation(scenario, model.mjcf)
-    state, checked = state_at(source, segment, own.mjcf, tick)
+    state, checked, events = state_at(source, segment, own.mjcf, tick)
     if scenario != segment.scenario:
         told = ""
         if state is not None:
             state, became = branch(state, segment.scenario, simulation)
             told = f"resumed from {source.path.name} with {changes}; {became}"
         segment = Segment(tick, scenario, told=told)
-    return Continuation(source, tick, segment, state, simulation, model), checked
+    return Continuation(source, tick, events, segment, state, simulation, model), checked
 
 
 def _tick(source: Recorded, at: float) -> int:

@@ -311,6 +311,19 @@ def test_a_torn_log_is_run_to_its_end(pd):
         on(torn, 1.3)
 
 
+def test_events_that_a_torn_log_has_lost_are_there_again(tmp_path):
+    """They are written after the ticks that they are of."""
+    limit = "imperfections.torque_limit=56"
+    log = log_of(tmp_path, [*PD, limit, "imperfections.velocity_noise=0.1"])
+    torn, lost = log.with_name("torn.mcap"), 0
+    for size in range(log.stat().st_size // 2, log.stat().st_size, 20_000):
+        torn.write_bytes(log.read_bytes()[:size])
+        info = log_info(torn)
+        lost += sum(e.t < info.duration for e in log_info(log).events) - len(info.events)
+        assert difference(log, on(torn, info.duration).run.log).equal
+    assert lost > 0
+
+
 def test_an_interrupted_run_is_finished(pd, tmp_path):
     def stop(_ticks: int) -> None:
         raise KeyboardInterrupt

@@ -93,14 +93,14 @@ def _tell(
 
 
 def diff(
-    one: Annotated[Path, typer.Argument(metavar="A", help="A log that `dnnmso run` wrote.")],
-    other: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
+    log: Log,
+    other: Log,
     as_json: Json = False,
 ) -> None:
     """Say where two logs first differ, and by how much; exit status 1 if they do."""
     from dnnmso_mj.difference import difference
 
-    found = difference(one, other)
+    found = difference(log, other)
     if as_json:
         print(json.dumps(found.plain()))
     else:
