@@ -104,6 +104,14 @@ class StepLayout:
             out[name] = column
         return out
 
+    def rows(self, columns: Mapping[str, Array]) -> Array:
+        """Columns of N ticks as rows (N, width); zeros where a column is narrower than here."""
+        rows = np.zeros((len(columns["t"]), self.width))
+        for name, where in self.slices.items():
+            column = columns[name].reshape(len(rows), -1)
+            rows[:, where.start : where.start + column.shape[1]] = column
+        return rows
+
 
 @dataclass(frozen=True)
 class Event:

@@ -23,6 +23,7 @@ from dnnmso_mj.cli import (
     logs,
     margins,
     report,
+    resume,
     run,
     scenarios,
     sweep,
@@ -158,6 +159,8 @@ app.command()(logs.plot)
 app.command()(logs.replay)
 app.command()(logs.info)
 app.command()(logs.recover)
+app.command()(resume.resume)
+app.command()(resume.diff)
 app.command()(scenarios.schema)
 app.command()(scenarios.scenarios)
 app.command()(bench.bench)

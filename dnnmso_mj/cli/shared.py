@@ -44,8 +44,11 @@ def working(what: str) -> AbstractContextManager[object]:
 
 
 @contextmanager
-def progress_bar(name: str, total: int) -> Iterator[Progress]:
-    """A bar on standard error, when that is a terminal; it takes the number of new steps."""
+def progress_bar(name: str, total: int | None) -> Iterator[Progress]:
+    """A bar on standard error, when that is a terminal; it takes the number of new steps.
+
+    Without a total (None) it says only that something goes on.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
     from rich.progress import TimeRemainingColumn as TimeColumn
