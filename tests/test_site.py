@@ -108,7 +108,7 @@ def test_the_command_line_reference_has_every_command(pages):
 
 def test_the_python_reference_has_every_public_name(pages):
     everywhere = set().union(*(page.ids for page in pages.values()))
-    assert {"dnnmso_mj.simulate", "dnnmso_mj.theory.TrackingBounds"} <= everywhere
+    assert {"dnnmso_mj.simulation.simulate", "dnnmso_mj.theory.TrackingBounds"} <= everywhere
     ids = pages["reference/python/index.html"].ids
     names = [name for name in dnnmso_mj.__all__ if not name.startswith("_")]
     assert len(names) > 10
