@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import sys
 import tempfile
-import urllib.parse
-import urllib.request
 from collections.abc import Iterator
-from http import HTTPStatus
 from pathlib import Path
-from signal import SIGHUP, SIGTERM
-from types import FrameType
 
 from mcap.records import Attachment
 
-from dnnmso_mj.errors import DnnmsoError, LogError, MissingExtraError, ScenarioError
+from dnnmso_mj.errors import DnnmsoError, LogError, ScenarioError
 from dnnmso_mj.log.format import MODEL, unwritable
 from dnnmso_mj.log.prefix import Prefix
 from dnnmso_mj.plant import Mjcf, build_spec, compile_spec
@@ -25,15 +18,16 @@ from dnnmso_mj.reading import read_trace
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.viewer.process import (
-    LOCAL,
-    check_port,
+    check_display,
+    check_rerun,
     free_port,
     headless_viewer,
-    listens,
     picture,
     rerun,
+    until_interrupted,
 )
 from dnnmso_mj.viewer.signals import TIMELINE
+from dnnmso_mj.viewer.web import web_server
 
 
 def save_rrd(log: Path, out: Path, first_tab: str = "Tracking") -> Path:
@@ -65,13 +59,11 @@ def open_viewer(log: Path) -> None:
         DnnmsoError: there is no display, or the viewer cannot start.
         LogError, MissingExtraError: as `save_rrd`.
     """
-    if sys.platform == "linux" and not _has_display():
-        raise DnnmsoError(
-            "no display: neither DISPLAY nor WAYLAND_DISPLAY is set. Use `dnnmso replay` with "
-            "--serve (a browser), --screenshot FILE.png, or --save FILE.rrd"
-        )
+    check_display(
+        "Use `dnnmso replay` with --serve (a browser), --screenshot FILE.png, or --save FILE.rrd"
+    )
     with (
-        _until_interrupted(),
+        until_interrupted(),
         _converted(log) as (rrd, _),
         rerun("--port", str(free_port()), str(rrd)) as viewer,
     ):
@@ -89,19 +81,14 @@ def serve(log: Path, port: int = 9090) -> None:
         DnnmsoError: the port is taken, or the server cannot start.
         LogError, MissingExtraError: as `save_rrd`.
     """
-    check_port(port)
-    data_port, page = free_port(), f"http://{LOCAL}:{port}"
-    data = urllib.parse.quote(f"rerun+http://{LOCAL}:{data_port}/proxy", safe="")
-    arguments = ("--serve-web", "--web-viewer-port", str(port), "--port", str(data_port))
     with (
-        _until_interrupted(),
+        until_interrupted(),
         _converted(log) as (rrd, _),
-        rerun(*arguments, str(rrd)) as server,
+        web_server(port, str(rrd)) as server,
     ):
-        server.wait_until(lambda: listens(data_port) and _answers(page), "ready")
-        print(f"{page}/?url={data}", flush=True)
+        print(server.page, flush=True)
         print("Ctrl-C ends it.", file=sys.stderr)
-        server.wait()
+        server.process.wait()
 
 
 def screenshot(
@@ -139,14 +126,9 @@ def screenshot(
 
 def _convert(log: Path, out: Path, first_tab: str) -> float:
     """Write the recording of a log; returns the time of the run's last tick (s)."""
-    try:
-        from dnnmso_mj.viewer.rrd import rrd_bytes
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "rerun":
-            raise
-        raise MissingExtraError(
-            "the viewer needs rerun, which is not installed: pip install 'dnnmso_mj[viewer]'"
-        ) from error
+    check_rerun()
+    from dnnmso_mj.viewer.rrd import rrd_bytes
+
     trace = read_trace(log)
     out.write_bytes(rrd_bytes(trace, _scene(log, trace.scenario), first_tab))
     return float(trace["t"][-1])
@@ -197,31 +179,3 @@ def _replacing(path: Path, suffix: str) -> Iterator[Path]:
             partial.replace(path)
     except OSError as error:
         raise unwritable(path, error) from error
-
-
-@contextlib.contextmanager
-def _until_interrupted() -> Iterator[None]:
-    """Leave the block in good order at Ctrl-C, on SIGTERM, or when the terminal closes."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (SIGTERM, SIGHUP)}
-    try:
-        with contextlib.suppress(KeyboardInterrupt):
-            yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _has_display() -> bool:
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def _answers(page: str) -> bool:
-    try:
-        with urllib.request.urlopen(page, timeout=1.0) as response:  # noqa: S310
-            return bool(response.status == HTTPStatus.OK)
-    except OSError:
-        return False

@@ -6,7 +6,7 @@ import time
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,8 +19,13 @@ from dnnmso_mj.realtime import left_in_peace, real_time_pace
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulate import AS_FAST_AS_CAN_BE, Progress, Simulation
+from dnnmso_mj.simulate import AS_FAST_AS_CAN_BE, Progress, Recorder, Simulation
 from dnnmso_mj.trace import Event, RunInfo, Trace
+
+if TYPE_CHECKING:
+    from dnnmso_mj.viewer.live import LiveView
+
+Array = np.ndarray
 
 MAX_NUMBERED = 10_000
 
@@ -40,6 +45,7 @@ def run_logged(
     force: bool = False,
     real_time: bool = False,
     progress: Progress | None = None,
+    live: LiveView | None = None,
 ) -> LoggedRun:
     """Run a scenario and leave a log with metrics.
 
@@ -52,32 +58,59 @@ def run_logged(
         force: whether an existing `out` is replaced.
         real_time: whether ticks are paced by the wall clock; see `realtime`.
         progress: called now and then with the number of ticks done since.
+        live: a viewer to show the run in while it goes on.
 
     Raises:
         ScenarioError: the model cannot be used; no log is left behind.
         LogError: the log exists or cannot be written.
+        DnnmsoError: the live view cannot start; no log is left behind.
         RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run.
     """
     mjcf = Mjcf.read(find_model(scenario.plant.model))
     pace = real_time_pace(scenario) if real_time else AS_FAST_AS_CAN_BE
     simulation = Simulation(scenario, mjcf, pace=pace)
-    with _open_log(simulation, mjcf, out, force) as recorder:
+    scene = Scene(simulation.plant.model)
+    if live is not None:
+        live.begin(scenario, scene, simulation.layout)
+    with _open_log(simulation, scene, mjcf, out, force) as recorder:
+        sink = recorder if live is None else _Tee(recorder, live)
         started = time.perf_counter()
         try:
             with left_in_peace() if real_time else nullcontext() as priority:
                 if priority:
-                    recorder.event(Event(0.0, "info", f"real time, {priority}"))
-                info = simulation.run(recorder, progress)
+                    sink.event(Event(0.0, "info", f"real time, {priority}"))
+                info = simulation.run(sink, progress)
         except KeyboardInterrupt as stop:
             wall = time.perf_counter() - started
             info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
-            trace = _finish(simulation, recorder, info)
+            trace = _finish(simulation, recorder, info, live)
             raise RunInterrupted(recorder.path, len(trace)) from stop
-        return LoggedRun(_finish(simulation, recorder, info), recorder.path)
+        return LoggedRun(_finish(simulation, recorder, info, live), recorder.path)
 
 
-def _finish(simulation: Simulation, recorder: McapRecorder, info: RunInfo) -> Trace:
-    """Compute the metrics of what the log holds, and end the log with them."""
+class _Tee:
+    """Hands on all of a run to its log, then to its viewer."""
+
+    def __init__(self, log: Recorder, live: Recorder) -> None:
+        self._log, self._live = log, live
+
+    def append(self, rows: Array) -> None:
+        self._log.append(rows)
+        self._live.append(rows)
+
+    def event(self, event: Event) -> None:
+        self._log.event(event)
+        self._live.event(event)
+
+    def snapshot(self, name: str, t: float, arrays: dict[str, Array]) -> None:
+        self._log.snapshot(name, t, arrays)
+        self._live.snapshot(name, t, arrays)
+
+
+def _finish(
+    simulation: Simulation, recorder: McapRecorder, info: RunInfo, live: LiveView | None
+) -> Trace:
+    """Compute the metrics of what the log holds, and end the log, and the live view, with them."""
     recorder.flush()
     if recorder.ticks:
         trace = read_trace(recorder.path)
@@ -91,11 +124,14 @@ def _finish(simulation: Simulation, recorder: McapRecorder, info: RunInfo) -> Tr
     trace = replace(trace, info=replace(info, **written))
     info = replace(trace.info, metrics=compute_metrics(trace))
     recorder.finish(info)
+    if live is not None:
+        live.end(info)
     return replace(trace, info=info)
 
 
-def _open_log(simulation: Simulation, mjcf: Mjcf, out: Path | None, force: bool) -> McapRecorder:
-    scene = Scene(simulation.plant.model)
+def _open_log(
+    simulation: Simulation, scene: Scene, mjcf: Mjcf, out: Path | None, force: bool
+) -> McapRecorder:
     scenario = simulation.scenario
     if out is not None:
         return McapRecorder(out, simulation.layout, scenario, scene, mjcf.text, force=force)
