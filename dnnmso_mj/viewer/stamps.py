@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import rerun as rr
 
 from dnnmso_mj.trace import Array
@@ -12,4 +13,5 @@ TICKS = "tick"
 
 def stamps(t: Array, ticks: Array) -> list[rr.TimeColumn]:
     """Times (s) and ticks, both (N,), as Rerun's time columns."""
-    return [rr.TimeColumn(TIMELINE, duration=t), rr.TimeColumn(TICKS, sequence=ticks)]
+    ns = np.rint(1e9 * t).astype("timedelta64[ns]")  # Rerun would cut, not round
+    return [rr.TimeColumn(TIMELINE, duration=ns), rr.TimeColumn(TICKS, sequence=ticks)]
