@@ -14,7 +14,7 @@ from dnnmso_mj.errors import DnnmsoError, LogError, ScenarioError
 from dnnmso_mj.log.format import MODEL, unwritable
 from dnnmso_mj.log.prefix import Prefix
 from dnnmso_mj.plant import Mjcf, build_spec, compile_spec
-from dnnmso_mj.reading import read_trace
+from dnnmso_mj.reading import read_snapshots, read_trace
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.viewer.process import (
@@ -26,7 +26,7 @@ from dnnmso_mj.viewer.process import (
     rerun,
     until_interrupted,
 )
-from dnnmso_mj.viewer.signals import TIMELINE
+from dnnmso_mj.viewer.stamps import TIMELINE
 from dnnmso_mj.viewer.web import web_server
 
 
@@ -130,7 +130,7 @@ def _convert(log: Path, out: Path, first_tab: str) -> float:
     from dnnmso_mj.viewer.rrd import rrd_bytes
 
     trace = read_trace(log)
-    out.write_bytes(rrd_bytes(trace, _scene(log, trace.scenario), first_tab))
+    out.write_bytes(rrd_bytes(trace, _scene(log, trace.scenario), first_tab, read_snapshots(log)))
     return float(trace["t"][-1])
 
 

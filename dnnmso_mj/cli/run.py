@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dnnmso_mj.cli.live import Port, Serve, View, live_view
 from dnnmso_mj.cli.shared import (
     DIVERGED,
     Json,
@@ -52,42 +53,48 @@ def run(
     real_time: Annotated[
         bool, typer.Option("--real-time", help="Keep to the wall clock, one tick each dt.")
     ] = False,
+    view: View = False,
+    serve: Serve = False,
+    port: Port = 9090,
     plot: Annotated[bool, typer.Option(help="Draw the figures beside the log.")] = True,
     as_json: Json = False,
 ) -> None:
-    """Run a scenario headless: log, figures, summary."""
+    """Run a scenario: log, figures, summary."""
     from dnnmso_mj.loading import load_scenario, located
     from dnnmso_mj.run import run_logged
     from dnnmso_mj.timing import timing
 
     sets = [*(overrides or []), *([] if seed is None else [f"seed={seed}"])]
     loaded = load_scenario(scenario, sets)
-    try:
-        with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
-            done = run_logged(loaded, out, force=force, real_time=real_time, progress=progress)
-    except ScenarioError as error:
-        raise located(error, scenario, sets) from error
-    except RunInterrupted as stop:
-        ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
-        raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
-    figures, undrawn = _draw(done) if plot else ([], None)
-    info = done.trace.info
-    if as_json:
-        print(json.dumps({
-            "status": info.status,
-            "reason": info.reason,
-            "scenario": loaded.name,
-            "log": str(done.log),
-            "figures": [str(figure) for figure in figures],
-            "seed": info.seed,
-            "wall_s": info.wall_s,
-            "metrics": dict(info.metrics),
-            **({"real_time": asdict(timing(done.trace))} if real_time else {}),
-        }))  # fmt: skip
-    else:
-        _print_summary(done.trace, done.log, figures)
-        if real_time:
-            _print_timing(timing(done.trace))
+    with live_view(view, serve, port) as live:
+        try:
+            with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
+                done = run_logged(
+                    loaded, out, force=force, real_time=real_time, progress=progress, live=live
+                )
+        except ScenarioError as error:
+            raise located(error, scenario, sets) from error
+        except RunInterrupted as stop:
+            ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
+            raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
+        figures, undrawn = _draw(done) if plot else ([], None)
+        info = done.trace.info
+        if as_json:
+            print(json.dumps({
+                "status": info.status,
+                "reason": info.reason,
+                "scenario": loaded.name,
+                "log": str(done.log),
+                "figures": [str(figure) for figure in figures],
+                "seed": info.seed,
+                "wall_s": info.wall_s,
+                "metrics": dict(info.metrics),
+                **({"real_time": asdict(timing(done.trace))} if real_time else {}),
+            }))  # fmt: skip
+        else:
+            _print_summary(done.trace, done.log, figures)
+            if real_time:
+                _print_timing(timing(done.trace))
     if undrawn is not None:
         raise undrawn
     if info.status == "diverged":

@@ -100,21 +100,24 @@ class LiveView:
 
     def end(self, info: RunInfo) -> None:
         """Tell how the run went; wait until the viewer has got it all, or takes no more."""
-        with suppress(OSError):  # it may be gone
+        why = self._deliver(info)
+        missed = self._ticks - self._ring.tally
+        if missed:
+            lost = f"the viewer did not get {missed:,} of {self._ticks:,} ticks, since {why}"
+            warnings.warn(f"{lost}; the log has them all", stacklevel=2)
+
+    def _deliver(self, info: RunInfo) -> str:
+        """Have all that waits brought to the viewer; says why it may not have got everything."""
+        with suppress(EOFError, OSError):
             self._control.send(info)
             delivered = -1
             while delivered < self._ring.tally:
                 delivered = self._ring.tally
                 if self._control.poll(_PATIENCE_S):
-                    break  # it says that it is done, or has ended
-        missed = self._ticks - self._ring.tally
-        if missed:
-            why = "was closed" if self._ring.closed else "was too slow"
-            warnings.warn(
-                f"the viewer did not get {missed:,} of {self._ticks:,} ticks, since it {why}; "
-                "the log has them all",
-                stacklevel=2,
-            )
+                    self._control.recv()  # "done"
+                    break
+            return "it was too slow"
+        return "it is gone" if self._ring.closed else self._process.complaint()
 
 
 @contextmanager

@@ -43,11 +43,18 @@ def main() -> None:
     control.send("ready")
     over: queue.SimpleQueue[RunInfo] = queue.SimpleQueue()
     threading.Thread(target=_follow, args=(control, over), daemon=True).start()
-    try:
-        _stream(ring, stream, recording, layout, scenario, over)
-    except RuntimeError:  # so Rerun says that the connection is severed
-        ring.close()
-    os._exit(0)  # Rerun's own end could wait for ever for a viewer that does not answer
+    info = None
+    while info is None:
+        with contextlib.suppress(queue.Empty):
+            info = over.get(timeout=_LOOK_S)
+        while messages := list(ring.take(_BATCH_BYTES)):
+            ticks = _send(messages, stream, layout, scenario)
+            _deliver(recording, ring)
+            ring.tally += ticks
+    stream.end(info)
+    _deliver(recording, ring)
+    recording.disconnect()
+    control.send("done")
 
 
 def _follow(control: Control, over: queue.SimpleQueue[RunInfo]) -> None:
@@ -58,30 +65,13 @@ def _follow(control: Control, over: queue.SimpleQueue[RunInfo]) -> None:
     os._exit(0)
 
 
-def _stream(
-    ring: Ring,
-    stream: RunStream,
-    recording: rr.RecordingStream,
-    layout: StepLayout,
-    scenario: Scenario,
-    over: queue.SimpleQueue[RunInfo],
-) -> None:
-    """Send all that comes.
-
-    Raises:
-        RuntimeError: the viewer is gone.
-    """
-    info = None
-    while info is None:
-        with contextlib.suppress(queue.Empty):
-            info = over.get(timeout=_LOOK_S)
-        while messages := list(ring.take(_BATCH_BYTES)):
-            ticks = _send(messages, stream, layout, scenario)
-            recording.flush()
-            ring.tally += ticks
-    stream.end(info)
-    recording.flush()
-    recording.disconnect()
+def _deliver(recording: rr.RecordingStream, ring: Ring) -> None:
+    """Wait until the viewer has got everything; end this process if it is gone."""
+    try:
+        recording.flush()
+    except RuntimeError:  # the connection is severed
+        ring.close()
+        os._exit(0)
 
 
 def _send(

@@ -1,0 +1,119 @@
+"""The weights of a controller as pictures, one a matrix and a snapshot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import rerun as rr
+
+from dnnmso_mj.network import network_shape
+from dnnmso_mj.scenario import DnnMsoReplay, LewisNn, Network, RbfMso, Scenario
+from dnnmso_mj.trace import Array
+from dnnmso_mj.viewer.blueprint import CHANGE, WEIGHTS
+from dnnmso_mj.viewer.stamps import stamps
+
+_SHOWN = 0.99  # of the values lie within the colours' scale; the rest has the last colour
+# From cyan over dark grey, which is zero, to yellow.
+_COLORS = rr.components.Colormap.CyanToYellow
+
+
+class HeatMaps:
+    """Weights W, and their change log₁₀|W/W₀| where they do not start from zero.
+
+    The scale of a matrix is that of its largest values so far. It stands beside the pictures and
+    not in them, so that all pictures of a matrix have the same.
+
+    Args:
+        recording: where to.
+        scenario: the experiment.
+        root: what the paths of all entities begin with.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, scenario: Scenario, root: str) -> None:
+        self.names = weight_names(scenario)
+        self._recording = recording
+        self._scenario = scenario
+        self._root = root
+        self._first: list[Array] = []
+        self._scales: dict[str, float] = {}
+
+    def send(self, t: float, state: Mapping[str, Array]) -> None:
+        """The matrices in a controller's state at t (s)."""
+        if not self.names:
+            return
+        matrices = weight_matrices(self._scenario, state)
+        self._first = self._first or matrices
+        for name, W, W0 in zip(self.names, matrices, self._first, strict=True):
+            self._send(f"{self._root}{WEIGHTS}/{name}", t, W)
+            if W0.any():
+                self._send(f"{self._root}{CHANGE}/{name}", t, change(W0, W))
+
+    def _send(self, path: str, t: float, values: Array) -> None:
+        scale = float(np.quantile(np.abs(values), _SHOWN))
+        if scale > self._scales.get(path, -1.0):
+            self._scales[path] = scale
+            limits = [-scale, scale] if scale else [-1.0, 1.0]
+            style = rr.DepthImage.from_fields(
+                depth_range=limits, colormap=_COLORS, magnification_filter="nearest"
+            )
+            self._recording.log(path, style, static=True)
+        picture = _squared(values).astype(np.float32)
+        times = stamps(np.array([t]), np.array([round(t / self._scenario.dt)]))
+        columns = rr.DepthImage.columns(
+            buffer=[picture.tobytes()],
+            format=[
+                rr.components.ImageFormat(
+                    width=picture.shape[1], height=picture.shape[0], channel_datatype="F32"
+                )
+            ],
+        )
+        self._recording.send_columns(path, times, columns)
+
+
+def weight_names(scenario: Scenario) -> list[str]:
+    """The weight matrices that a controller of this scenario has, from the input on."""
+    match scenario.controller:
+        case LewisNn():
+            return ["V", "W"]
+        case RbfMso():
+            return ["W"]
+    network = _network(scenario)
+    return [f"W{k + 1}" for k in range(len(network.hidden) + 1)] if network else []
+
+
+def weight_matrices(scenario: Scenario, state: Mapping[str, Array]) -> list[Array]:
+    """The matrices that `weight_names` names, (outputs, inputs) each, from a controller's state.
+
+    Raises:
+        KeyError: the state is not one of this scenario's controller.
+    """
+    network = _network(scenario)
+    if network is None:
+        return [state[name].T for name in weight_names(scenario)]
+    flat, n = state["weights"], scenario.n_joints
+    shapes = [network_shape(network, 2 * n, n_out) for n_out in (n, 2 * n)]
+    return next(shape for shape in shapes if shape.n_weights == flat.size).split(flat)
+
+
+def change(before: Array, after: Array) -> Array:
+    """log₁₀|W/W₀| of each weight, 0 where it was or is zero: Madam never changes a sign."""
+    both = (before != 0.0) & (after != 0.0)
+    ratio = np.divide(after, before, out=np.ones_like(after), where=both)
+    logarithm: Array = np.log10(np.abs(ratio))
+    return logarithm
+
+
+def _network(scenario: Scenario) -> Network | None:
+    controller = scenario.controller
+    if isinstance(controller, DnnMsoReplay):
+        return controller.network.as_network()
+    network = getattr(controller, "network", None)
+    return network if isinstance(network, Network) else None
+
+
+def _squared(values: Array) -> Array:
+    """Each entry as a block of pixels, so that the picture is about as high as it is wide."""
+    rows, columns = values.shape
+    tall, wide = max(1, round(columns / rows)), max(1, round(rows / columns))
+    return np.repeat(np.repeat(values, tall, axis=0), wide, axis=1)

@@ -1,0 +1,150 @@
+"""What happens in a run, as coloured bands over its time: limits, deadlines, and the events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+
+from dnnmso_mj.scenario import Freeze, Payload, Push, Scenario
+from dnnmso_mj.trace import Array, Trace
+from dnnmso_mj.viewer.plot import RED, Rgb
+from dnnmso_mj.viewer.stamps import stamps
+
+GONE = ""  # the viewer's word for a gap
+GOOD: Rgb = (46, 110, 70)
+BAD: Rgb = (200, 60, 60)
+_ORANGE, _BLUE, _VIOLET, _YELLOW = (190, 110, 30), (50, 105, 180), (120, 85, 180), (150, 125, 40)
+ENDS = {"diverged": BAD, "failed": BAD, "interrupted": (110, 110, 110), "unfinished": BAD}
+_TAIL = 0.02  # of the run: how long its end is shown where that was not as planned
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One band: at each tick one of its states, whose word and colour it shows.
+
+    Args:
+        name: what stands over it, and its place among all lanes.
+        words: of the states; an empty one leaves a gap.
+        colors: of the states.
+        states: a stretch of N ticks and their numbers (N,) -> the number of each tick's state (N,).
+    """
+
+    name: str
+    words: tuple[str, ...]
+    colors: tuple[Rgb, ...]
+    states: Callable[[Trace, Array], Array]
+
+
+class Lanes:
+    """A run's bands on their way into Rerun, a stretch of ticks at a time.
+
+    Args:
+        recording: where to.
+        scenario: the experiment.
+        root: what the paths of all entities begin with.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, scenario: Scenario, root: str) -> None:
+        self._recording = recording
+        self._dt = scenario.dt
+        self._root = root
+        self._lanes = lanes(scenario)
+        self.names = [lane.name for lane in self._lanes]
+        self._last = dict.fromkeys(self.names, -1)
+        self._tick = 0
+
+    def begin(self) -> None:
+        """The colour of each state."""
+        for lane in self._lanes:
+            pairs = zip(lane.words, lane.colors, strict=True)
+            colors = {word: color for word, color in pairs if word != GONE}
+            if lane is self._lanes[0]:
+                colors |= ENDS
+            style = rr.StateConfiguration(values=list(colors), colors=list(colors.values()))
+            self._recording.log(self._root + lane.name, style, static=True)
+
+    def send(self, trace: Trace, ticks: Array) -> None:
+        """The changes in a stretch of ticks (N,)."""
+        for lane in self._lanes:
+            states = lane.states(trace, ticks)
+            before = np.concatenate([[self._last[lane.name]], states[:-1]])
+            changes = np.flatnonzero(states != before)
+            self._last[lane.name] = int(states[-1])
+            words = [lane.words[state] for state in states[changes]]
+            self._send(lane, ticks[changes], words)
+        self._tick = int(ticks[-1])
+
+    def end(self, status: str) -> None:
+        """The end of the run, which is a state of its first lane where it was not as planned."""
+        if status in ENDS:
+            gone = self._tick + max(1, round(_TAIL * self._tick))
+            self._send(self._lanes[0], np.array([self._tick, gone]), [status, GONE])
+
+    def _send(self, lane: Lane, ticks: Array, words: list[str]) -> None:
+        if len(ticks):
+            columns = rr.StateChange.columns(state=words)
+            self._recording.send_columns(
+                self._root + lane.name, stamps(ticks * self._dt, ticks), columns
+            )
+
+
+def lanes(scenario: Scenario) -> list[Lane]:
+    """The bands of a scenario: how the run goes, and one for each kind of event that it has."""
+    made = [Lane("run", ("running", "torque limit", "deadline missed"), (GOOD, _ORANGE, RED), _run)]
+    kinds = {type(event) for event in scenario.events}
+    if Freeze in kinds:
+        made.append(_freezes(scenario))
+    if Payload in kinds:
+        made.append(_payloads(scenario))
+    if Push in kinds:
+        made.append(_pushes(scenario))
+    return made
+
+
+def _run(trace: Trace, ticks: Array) -> Array:
+    return np.where(trace["deadline_missed"], 2, trace["saturated"].astype(int))
+
+
+def _freezes(scenario: Scenario) -> Lane:
+    freezes = sorted((e for e in scenario.events if isinstance(e, Freeze)), key=lambda e: e.at)
+    words = {"model": "learning has ended", "all": "learning and disturbance estimate have ended"}
+    at = _ticks([event.at for event in freezes], scenario)
+    return Lane(
+        "learning",
+        (GONE, *(words[event.what] for event in freezes)),
+        (GOOD, *[_BLUE] * len(freezes)),
+        lambda trace, ticks: np.searchsorted(at, ticks, side="right"),
+    )
+
+
+def _payloads(scenario: Scenario) -> Lane:
+    payloads = sorted((e for e in scenario.events if isinstance(e, Payload)), key=lambda e: e.at)
+    carried = np.cumsum([event.mass for event in payloads])
+    at = _ticks([event.at for event in payloads], scenario)
+    return Lane(
+        "payload",
+        (GONE, *(f"{mass:+.4g} kg" if abs(mass) > 1e-12 else GONE for mass in carried)),
+        (GOOD, *[_VIOLET] * len(payloads)),
+        lambda trace, ticks: np.searchsorted(at, ticks, side="right"),
+    )
+
+
+def _pushes(scenario: Scenario) -> Lane:
+    pushes = [event for event in scenario.events if isinstance(event, Push)]
+    begins = np.sort(_ticks([event.at for event in pushes], scenario))
+    lasts = _ticks([event.duration for event in pushes], scenario)
+    ends = np.sort(_ticks([event.at for event in pushes], scenario) + lasts)
+
+    def states(trace: Trace, ticks: Array) -> Array:
+        begun = np.searchsorted(begins, ticks, side="right")
+        acting: Array = begun > np.searchsorted(ends, ticks, side="right")
+        return acting.astype(int)
+
+    return Lane("push", (GONE, "push"), (GOOD, _YELLOW), states)
+
+
+def _ticks(times: list[float], scenario: Scenario) -> Array:
+    return np.array([round(t / scenario.dt) for t in times])
