@@ -116,7 +116,7 @@ class LiveView:
                 if self._control.poll(_PATIENCE_S):
                     self._control.recv()  # "done"
                     break
-            return "it was too slow"
+            return "it took them too slowly, or not at all"
         return "it is gone" if self._ring.closed else self._process.complaint()
 
 
@@ -165,7 +165,7 @@ def window() -> Iterator[LiveView]:
     """
     check_rerun()
     check_display("Use --serve (a browser), or run without --view and `dnnmso replay` the log")
-    with _started("--hide-welcome-screen", "--expect-data-soon") as live:
+    with started("--hide-welcome-screen", "--expect-data-soon") as live:
         yield live
 
 
@@ -191,7 +191,7 @@ def served(port: int) -> Iterator[LiveView]:
 
 
 @contextmanager
-def _started(*arguments: str) -> Iterator[LiveView]:
+def started(*arguments: str) -> Iterator[LiveView]:
     """A view in a viewer started with these arguments, which stays if there was a run."""
     port = free_port()
     with rerun("--port", str(port), *arguments) as viewer:

@@ -39,8 +39,8 @@ def main() -> None:
     recording = rr.RecordingStream(APPLICATION)
     recording.connect_grpc(sys.argv[3])
     stream = RunStream(recording, scenario, scene, layout)
+    control.send("ready")  # from here on the viewer is waited for, as long as it takes
     stream.begin()
-    control.send("ready")
     over: queue.SimpleQueue[RunInfo] = queue.SimpleQueue()
     threading.Thread(target=_follow, args=(control, over), daemon=True).start()
     info = None
