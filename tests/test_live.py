@@ -173,7 +173,9 @@ def test_a_viewer_that_takes_nothing_costs_nothing_but_patience(
         with connected(data_address(port), backlog=2**20) as view:
             os.killpg(group, signal.SIGSTOP)
             try:
-                with pytest.warns(UserWarning, match=r"of 10,000 ticks, since it took them too slowly"):
+                with pytest.warns(
+                    UserWarning, match=r"of 10,000 ticks, since it took them too slowly"
+                ):
                     done = ten_seconds(tmp_path, live=view)
             finally:
                 os.killpg(group, signal.SIGCONT)
@@ -204,10 +206,22 @@ def test_a_streamer_that_dies_is_told_by_its_last_words(plain, tmp_path):
     assert_untouched(done, plain)
 
 
-def test_an_address_that_is_none_is_refused_before_the_run(tmp_path):
+def test_an_address_that_is_none_is_told(plain, tmp_path):
     with (
-        pytest.raises(DnnmsoError, match=r"the live view cannot start: .*nonsense"),
         connected("nonsense") as view,
+        pytest.warns(UserWarning, match=r"10,000 of 10,000 ticks, since .*nonsense"),
+    ):
+        done = ten_seconds(tmp_path, live=view)
+    assert_untouched(done, plain)
+
+
+def test_a_streamer_that_cannot_start_is_told_before_the_run(
+    tmp_path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(live, "STREAMER", "dnnmso_mj.viewer.nowhere")
+    with (
+        pytest.raises(DnnmsoError, match=r"the live view cannot start: .*nowhere"),
+        connected(data_address(free_port())) as view,
     ):
         ten_seconds(tmp_path, live=view)
     assert not list(tmp_path.iterdir())

@@ -37,12 +37,13 @@ def main() -> None:
     control: Control = Connection(int(sys.argv[2]))
     scenario, scene, layout = control.recv()
     recording = rr.RecordingStream(APPLICATION)
-    recording.connect_grpc(sys.argv[3])
     stream = RunStream(recording, scenario, scene, layout)
-    control.send("ready")  # from here on the viewer is waited for, as long as it takes
-    stream.begin()
     over: queue.SimpleQueue[RunInfo] = queue.SimpleQueue()
     threading.Thread(target=_follow, args=(control, over), daemon=True).start()
+    control.send("ready")
+    # From here on the viewer is waited for, as long as it takes.
+    recording.connect_grpc(sys.argv[3])
+    stream.begin()
     info = None
     while info is None:
         with contextlib.suppress(queue.Empty):
