@@ -11,7 +11,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -310,9 +310,20 @@ def test_a_run_that_is_ended_takes_its_page_along(tmp_path, number, status):
         command.send_signal(number)
         assert command.wait(timeout=20) == status
     wait_until(lambda: not any(listens(port) for port in ports))
+    wait_until(lambda: not streams_to(data_address(ports[1])))
     found = log_info(log)
     assert found.status == ("interrupted" if status == 130 else "unfinished")
     assert found.ticks > 100
+
+
+def streams_to(address: str) -> bool:
+    """Whether any process has this address in its command."""
+    commands = (folder / "cmdline" for folder in Path("/proc").iterdir() if folder.name.isdigit())
+    for command in commands:
+        with suppress(OSError):
+            if address.encode() in command.read_bytes():
+                return True
+    return False
 
 
 def wait_until(happened: Callable[[], bool]) -> None:
