@@ -19,6 +19,7 @@ import pytest
 from rerun_programs import children, entities, listening_addresses, ports_of, processes, rows
 from vulkan import needs_vulkan
 
+from dnnmso_mj.cli.live import live_view
 from dnnmso_mj.errors import DnnmsoError, MissingExtraError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.reading import log_info
@@ -239,6 +240,11 @@ def test_a_port_that_is_taken_is_refused():
         port = taken.getsockname()[1]
         with pytest.raises(DnnmsoError, match=f"port {port} of 127"), served(port):
             pass
+
+
+def test_a_window_and_a_page_at_once_are_refused():
+    with pytest.raises(DnnmsoError, match="--view and --serve: allowed: one of them"):
+        live_view(view=True, serve=True, port=9090)
 
 
 def dnnmso(*arguments: object, cwd: Path, **environment: str) -> subprocess.Popen[str]:
