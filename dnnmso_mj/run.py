@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dnnmso_mj.assets import read_assets
 from dnnmso_mj.errors import LogError, RunInterrupted
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.paths import find_model, logs_dir
@@ -19,13 +21,12 @@ from dnnmso_mj.realtime import left_in_peace, real_time_pace
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulate import AS_FAST_AS_CAN_BE, Progress, Recorder, Simulation
-from dnnmso_mj.trace import Event, RunInfo, Trace
+from dnnmso_mj.simulation import AS_FAST_AS_CAN_BE, Progress, Simulation
+from dnnmso_mj.tee import Tee
+from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
 
 if TYPE_CHECKING:
     from dnnmso_mj.viewer.live import LiveView
-
-Array = np.ndarray
 
 MAX_NUMBERED = 10_000
 
@@ -73,50 +74,61 @@ def run_logged(
     if live is not None:
         live.begin(scenario, scene, simulation.layout)
     with _open_log(simulation, scene, mjcf, out, force) as recorder:
-        sink = recorder if live is None else _Tee(recorder, live)
-        started = time.perf_counter()
-        try:
+        sink = recorder if live is None else Tee(recorder, live)
+
+        def run() -> RunInfo:
             with left_in_peace() if real_time else nullcontext() as priority:
                 if priority:
                     sink.event(Event(0.0, "info", f"real time, {priority}"))
-                info = simulation.run(sink, progress)
-        except KeyboardInterrupt as stop:
-            wall = time.perf_counter() - started
-            info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
-            trace = _finish(simulation, recorder, info, live)
-            raise RunInterrupted(recorder.path, len(trace)) from stop
-        return LoggedRun(_finish(simulation, recorder, info, live), recorder.path)
+                return simulation.run(sink, progress)
+
+        return run_to_end(run, recorder, scenario, simulation.layout, live)
 
 
-class _Tee:
-    """Hands on all of a run to its log, then to its viewer."""
+def run_to_end(
+    run: Callable[[], RunInfo],
+    recorder: McapRecorder,
+    scenario: Scenario,
+    layout: StepLayout,
+    live: LiveView | None = None,
+) -> LoggedRun:
+    """Run, and end the log, and the live view, with the metrics of what was run.
 
-    def __init__(self, log: Recorder, live: Recorder) -> None:
-        self._log, self._live = log, live
+    Args:
+        run: fills the log.
+        recorder: of the log.
+        scenario: that is run.
+        layout: of the log's rows.
+        live: the view, which the run fills too.
 
-    def append(self, rows: Array) -> None:
-        self._log.append(rows)
-        self._live.append(rows)
-
-    def event(self, event: Event) -> None:
-        self._log.event(event)
-        self._live.event(event)
-
-    def snapshot(self, name: str, t: float, arrays: dict[str, Array]) -> None:
-        self._log.snapshot(name, t, arrays)
-        self._live.snapshot(name, t, arrays)
+    Raises:
+        RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run.
+    """
+    started = time.perf_counter()
+    try:
+        info = run()
+    except KeyboardInterrupt as stop:
+        wall = time.perf_counter() - started
+        info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
+        trace = _finish(recorder, scenario, layout, info, live)
+        raise RunInterrupted(recorder.path, len(trace)) from stop
+    return LoggedRun(_finish(recorder, scenario, layout, info, live), recorder.path)
 
 
 def _finish(
-    simulation: Simulation, recorder: McapRecorder, info: RunInfo, live: LiveView | None
+    recorder: McapRecorder,
+    scenario: Scenario,
+    layout: StepLayout,
+    info: RunInfo,
+    live: LiveView | None,
 ) -> Trace:
-    """Compute the metrics of what the log holds, and end the log, and the live view, with them."""
+    """Compute the metrics of what the log holds, and end log and view with them."""
     recorder.flush()
     if recorder.ticks:
         trace = read_trace(recorder.path)
     else:  # ended before its first row
-        empty = np.empty((0, simulation.layout.width))
-        trace = Trace(simulation.layout.columns(empty), simulation.scenario, info)
+        empty = np.empty((0, layout.width))
+        trace = Trace(layout.columns(empty), scenario, info)
     written: dict[str, Any] = {
         "versions": trace.info.versions,
         "git_commit": trace.info.git_commit,
@@ -132,16 +144,18 @@ def _finish(
 def _open_log(
     simulation: Simulation, scene: Scene, mjcf: Mjcf, out: Path | None, force: bool
 ) -> McapRecorder:
-    scenario = simulation.scenario
+    scenario, files = simulation.scenario, read_assets(mjcf)
     if out is not None:
-        return McapRecorder(out, simulation.layout, scenario, scene, mjcf.text, force=force)
+        return McapRecorder(
+            out, simulation.layout, scenario, scene, mjcf.text, force=force, files=files
+        )
     for number in range(1, MAX_NUMBERED):
         suffix = f"-{number}" if number > 1 else ""
         path = logs_dir() / f"{scenario.name}{suffix}.mcap"
         if path.exists():
             continue
         try:
-            return McapRecorder(path, simulation.layout, scenario, scene, mjcf.text)
+            return McapRecorder(path, simulation.layout, scenario, scene, mjcf.text, files=files)
         except LogError:
             if not path.exists():
                 raise

@@ -138,7 +138,7 @@ def connected(address: str, backlog: int = BACKLOG_BYTES) -> Iterator[LiveView]:
         handed = (memory, its_control.fileno())
         process = subprocess.Popen(  # noqa: S603
             [sys.executable, "-P", "-m", STREAMER, *map(str, handed), address],
-            env={**os.environ, "PYTHONPATH": python_path(), "RUST_LOG": "off"},
+            env={**os.environ, "PYTHONPATH": _import_path(), "RUST_LOG": "off"},
             stdin=subprocess.DEVNULL,
             stdout=messages,
             stderr=messages,
@@ -153,6 +153,11 @@ def connected(address: str, backlog: int = BACKLOG_BYTES) -> Iterator[LiveView]:
         finally:
             process.kill()
             process.wait()
+
+
+def _import_path() -> str:
+    """A PYTHONPATH by which the streamer finds all that this process finds: a plug-in, too."""
+    return os.pathsep.join([python_path(), *sys.path])
 
 
 @contextmanager
