@@ -41,22 +41,23 @@ def listening_addresses(port: int) -> set[str]:
     }
 
 
-def entities(rrd: Path) -> set[str]:
-    """Paths of all that a Rerun file shows."""
+def contents(rrd: Path) -> dict[str, dict[str, list]]:
+    """Entity -> component -> pairs of its tick (-1: it always holds) and its value, by their ticks.
+
+    A property of the file as a whole, such as when it was begun, is no entity.
+    """
     from rerun.chunk import RrdReader
 
-    return {chunk.entity_path for chunk in RrdReader(rrd).stream()}
-
-
-def rows(rrd: Path, entity: str) -> dict[str, list]:
-    """Component -> pairs of its tick (-1 for what always holds) and its value, by their ticks."""
-    from rerun.chunk import RrdReader
-
-    found: dict[str, list] = {}
-    for chunk in RrdReader(rrd).stream().filter(content=entity):
+    found: dict[str, dict[str, list]] = {}
+    for chunk in RrdReader(rrd).stream():
         batch = chunk.to_record_batch()
         names = batch.schema.names
         ticks = batch["tick"].to_pylist() if "tick" in names else [-1] * len(batch)
+        components = found.setdefault(chunk.entity_path, {})
         for name in (name for name in names if ":" in name):
-            found.setdefault(name, []).extend(zip(ticks, batch[name].to_pylist(), strict=True))
-    return {name: sorted(pairs, key=lambda pair: pair[0]) for name, pairs in found.items()}
+            pairs = zip(ticks, batch[name].to_pylist(), strict=True)
+            components.setdefault(name, []).extend(pairs)
+    for pairs in (pairs for components in found.values() for pairs in components.values()):
+        pairs.sort(key=lambda pair: pair[0])
+    found.pop("/__properties", None)
+    return found
