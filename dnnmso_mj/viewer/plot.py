@@ -31,13 +31,15 @@ THIN, NORMAL, BROAD = 1.0, 1.5, 4.0  # points; a broad line is seen on both side
 
 @dataclass(frozen=True)
 class Line:
-    """One value a tick."""
+    """One value a tick; lines of one name have one entry in the legend."""
 
     name: str
     values: Values
     color: Rgb
     width: float = NORMAL
     place: float = 0.0  # among its like: 0 for the first joint or layer, 1 for the last
+    # What a value is held against is its context; the reference is the same for several runs.
+    role: Literal["value", "context", "shared"] = "value"
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Plot:
     # What a pixel shows of the many ticks that fall on it. Of a logarithm the low peaks are mere
     # zero crossings. Never the mean: it would hide the peaks of torque and of compute time.
     pixel: Literal["extremes", "largest"] = "extremes"
-    legend: Corner = "RightTop"  # where the lines seldom are
+    legend: Corner | None = None  # None: the lines have the colours of another plot's
 
 
 def joint_color(joint: int) -> Rgb:
@@ -77,6 +79,12 @@ def places(count: int) -> list[float]:
 def lighter(color: Rgb, share: float = 0.6) -> Rgb:
     """A colour with this share of white."""
     red, green, blue = (round((1.0 - share) * c + share * 255) for c in color)
+    return red, green, blue
+
+
+def darker(color: Rgb) -> Rgb:
+    """A colour for white words to stand on."""
+    red, green, blue = (round(0.55 * c) for c in color)
     return red, green, blue
 
 
@@ -96,7 +104,7 @@ def difference(name: str, other: str, k: int) -> Values:
 
 
 def distance(name: str, other: str, entries: slice) -> Values:
-    """‖a − b‖ of some entries of two columns."""
+    """Euclidean distance of two columns in some of their entries."""
     return lambda trace: np.linalg.norm(trace[name][:, entries] - trace[other][:, entries], axis=1)
 
 
