@@ -158,7 +158,7 @@ def _several(logs: Logs) -> Sequence[Path]:
 
 
 def _convert(logs: Sequence[Path], out: Path, first_tab: str, side_by_side: bool) -> float:
-    """Write the recording of some logs; returns the time of their last tick (s)."""
+    """Write the recording of some logs; returns the last time in it (s)."""
     try:
         from dnnmso_mj.viewer.rrd import Run, rrd_bytes
     except ModuleNotFoundError as error:
@@ -172,7 +172,8 @@ def _convert(logs: Sequence[Path], out: Path, first_tab: str, side_by_side: bool
         trace = read_trace(log)
         runs.append(Run(name, trace, _scene(log, trace.scenario), read_snapshots(log)))
     out.write_bytes(rrd_bytes(runs, first_tab, side_by_side=side_by_side))
-    return max(float(run.trace["t"][-1]) for run in runs)
+    last_ticks = [float(run.trace["t"][-1]) for run in runs]
+    return max([*last_ticks, *(snapshot.t for run in runs for snapshot in run.snapshots)])
 
 
 def run_names(logs: Sequence[Path]) -> list[str]:
@@ -207,7 +208,7 @@ def _scene(log: Path, scenario: Scenario) -> Scene:
 
 @contextlib.contextmanager
 def _converted(logs: Logs, first_tab: str, side_by_side: bool) -> Iterator[tuple[Path, float]]:
-    """The recording of some logs in a temporary file, and its last time (s)."""
+    """The recording of some logs in a temporary file, and the last time in it (s)."""
     several = _several(logs)
     with tempfile.TemporaryDirectory(prefix="dnnmso-") as folder:
         rrd = Path(folder) / f"{several[0].stem}.rrd"

@@ -15,7 +15,7 @@ from dnnmso_mj.viewer.stamps import TIMELINE
 
 ARM, DESIRED, TRAIL = "arm", "desired", "trail"
 PLOTS, EVENTS, SUMMARY = "plots", "events", "summary"
-WEIGHTS, CHANGE = "weights", "weight_change"
+WEIGHTS, RATIOS = "weights", "weight_ratios"
 
 _PANEL = 800.0  # height of a tab in pixels, about
 _LANE, _LANES_HEAD = 41.0, 22.0  # pixels
@@ -36,7 +36,7 @@ class Shown:
         prefix: what the paths of its entities begin with.
         tabs: tab name -> its plots, as `signals.plot_tabs` gives them.
         lanes: names of its bands.
-        matrices: names of its weight matrices.
+        matrices, ratios: names of its weight matrices, and of those whose change is shown.
         centre, half_size: what the camera must show (m).
     """
 
@@ -45,6 +45,7 @@ class Shown:
     tabs: Mapping[str, Sequence[Plot]]
     lanes: Sequence[str]
     matrices: Sequence[str]
+    ratios: Sequence[str]
     centre: Point
     half_size: float
 
@@ -135,14 +136,13 @@ def _column(views: Column, runs: Sequence[Shown]) -> rrb.Container:
 
 
 def _pictures(run: Shown) -> rrb.Container:
+    """The weights, and under them how each has changed."""
     rows = [
-        rrb.Grid(
-            *(_picture(f"{run.prefix}{root}/{name}", title.format(name)) for name in run.matrices),
-            grid_columns=min(len(run.matrices), _ABREAST),
-        )
-        for root, title in ((WEIGHTS, "{}"), (CHANGE, "ratio"))
+        [_picture(f"{run.prefix}{WEIGHTS}/{name}", name) for name in run.matrices],
+        [_picture(f"{run.prefix}{RATIOS}/{name}", "ratio") for name in run.ratios],
     ]
-    return rrb.Vertical(*rows, name=run.name or None)
+    grids = [rrb.Grid(*row, grid_columns=min(len(row), _ABREAST)) for row in rows if row]
+    return rrb.Vertical(*grids, name=run.name or None)
 
 
 def _picture(path: str, title: str) -> rrb.Spatial2DView:

@@ -17,7 +17,7 @@ from dnnmso_mj.viewer.stamps import stamps
 GONE = ""  # the viewer's word for a gap
 GOOD: Rgb = (46, 110, 70)
 BAD: Rgb = (200, 60, 60)
-_ORANGE, _BLUE, _VIOLET, _YELLOW = (190, 110, 30), (50, 105, 180), (120, 85, 180), (150, 125, 40)
+_ORANGE, _BLUE, _VIOLET, _YELLOW = (225, 125, 20), (50, 105, 180), (120, 85, 180), (150, 125, 40)
 ENDS = {"diverged": BAD, "failed": BAD, "interrupted": (110, 110, 110), "unfinished": BAD}
 _TAIL = 0.03  # of the run: how long its end is shown where that was not as planned
 

@@ -144,6 +144,7 @@ class RunStream:
     @property
     def shown(self) -> Shown:
         """What there is to lay out."""
+        maps = self._heat_maps
         centre, half_size = stage(self.scenario, self._scene)
         x, y, z = (c + offset for c, offset in zip(centre, self.look.offset, strict=True))
         return Shown(
@@ -151,7 +152,8 @@ class RunStream:
             prefix=self._prefix,
             tabs=self._tabs,
             lanes=self._lanes.names,
-            matrices=self._heat_maps.names,
+            matrices=maps.names,
+            ratios=[name for name in maps.names if name not in maps.from_zero],
             centre=(x, y, z),
             half_size=half_size,
         )
