@@ -27,6 +27,7 @@ from dnnmso_mj.plant import Mjcf, build_spec, compile_spec
 from dnnmso_mj.reading import read_snapshots, read_trace
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
+from dnnmso_mj.viewer.plot import TIMELINE
 from dnnmso_mj.viewer.process import (
     LOCAL,
     check_port,
@@ -36,7 +37,6 @@ from dnnmso_mj.viewer.process import (
     picture,
     rerun,
 )
-from dnnmso_mj.viewer.stamps import TIMELINE
 
 Logs = Path | Sequence[Path]
 

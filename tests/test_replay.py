@@ -26,7 +26,6 @@ from dnnmso_mj.replay import save_rrd
 from dnnmso_mj.run import run_logged
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.trace import Trace
-from dnnmso_mj.viewer.plot import Plot, joint_color
 
 SHORT = ("duration=0.6", "controller.network.hidden=[8, 8]")
 SHAPE = ("plant.lengths=[0.7, 1.2]", "plant.masses=[1.0, 1.5]", "imperfections.torque_limit=45")

@@ -10,8 +10,7 @@ from rerun.blueprint.encodings import TimelineColumn
 
 from dnnmso_mj.errors import LogError
 from dnnmso_mj.viewer.look import Point
-from dnnmso_mj.viewer.plot import Plot
-from dnnmso_mj.viewer.stamps import TIMELINE
+from dnnmso_mj.viewer.plot import TIMELINE, Plot
 
 ARM, DESIRED, TRAIL = "arm", "desired", "trail"
 PLOTS, EVENTS, SUMMARY = "plots", "events", "summary"

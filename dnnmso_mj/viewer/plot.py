@@ -14,6 +14,7 @@ Rgb = tuple[int, int, int]
 Corner = Literal["LeftTop", "LeftBottom", "RightTop", "RightBottom"]
 Values = Callable[[Trace], Array]  # a stretch of N ticks -> (N,); a NaN leaves a gap
 
+TIMELINE = "time"  # what every line, pose and event is placed on: simulated time
 JOINT_COLORS: tuple[Rgb, ...] = (
     (66, 150, 250),
     (255, 150, 50),
