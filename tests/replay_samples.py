@@ -36,8 +36,9 @@ def read_component(rrd: Path, entity: str, component: str) -> list:
     for batch in _batches(rrd)[f"/{entity}"]:
         if component in batch.schema.names:
             values = batch[component].to_pylist()
-            known = "tick" in batch.schema.names  # else it holds for all times
-            rows += zip(batch["tick"].to_pylist() if known else [-1], values, strict=True)
+            timeless = [-1] * len(values)
+            ticks = batch["tick"].to_pylist() if "tick" in batch.schema.names else timeless
+            rows += zip(ticks, values, strict=True)
     return [value for _, value in sorted(rows, key=lambda row: row[0])]
 
 

@@ -179,7 +179,8 @@ def test_bands_say_when_what_happens(rrd: Path, trace: Trace) -> None:
     assert len(changes) > 2  # or this test would see nothing
     words = {True: "torque limit", False: "running"}
     assert read_bands(rrd, "run") == [
-        (pytest.approx(trace["t"][k]), words[bool(saturated[k])]) for k in changes
+        *((pytest.approx(trace["t"][k]), words[bool(saturated[k])]) for k in changes),
+        (0.6, ""),
     ]
 
 

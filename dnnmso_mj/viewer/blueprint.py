@@ -16,7 +16,7 @@ ARM, DESIRED, TRAIL = "arm", "desired", "trail"
 PLOTS, EVENTS, SUMMARY = "plots", "events", "summary"
 WEIGHTS, RATIOS = "weights", "weight_ratios"
 
-_PANEL = 800.0  # height of a tab in pixels, about
+_PANEL = 740.0  # height of a tab in pixels, about
 _LANE, _LANES_HEAD = 41.0, 22.0  # pixels
 _ABREAST = 5  # so many pictures stand side by side
 _MOST_LANES = 6  # more are scrolled to
@@ -86,8 +86,9 @@ def _tab_names(runs: Sequence[Shown]) -> list[str]:
 
 def _tab(name: str, runs: Sequence[Shown]) -> rrb.Container:
     """The plots of a tab in columns, each under the bands of what happens meanwhile."""
-    plots = {plot.path: plot for run in runs for plot in run.tabs.get(name, ())}
-    views: dict[str, View] = {path: _plot_view(plot, runs) for path, plot in plots.items()}
+    views: dict[str, View] = {}
+    for plot in (plot for run in runs for plot in run.tabs.get(name, ())):
+        views.setdefault(plot.path, _plot_view(plot, runs))
     match name:
         case "Scene":
             arm = _arm_view(runs, "The way of the tip, and the way it should go", aspect=2.0)
@@ -196,12 +197,15 @@ def _stage(runs: Sequence[Shown], aspect: float) -> tuple[Point, float]:
 
 
 def _plot_view(plot: Plot, runs: Sequence[Shown]) -> rrb.TimeSeriesView:
+    like = [other for run in runs for others in run.tabs.values() for other in others]
+    ranges = {other.y_range for other in like if other.path == plot.path}
+    y_range = ranges.pop() if len(ranges) == 1 else None
     return rrb.TimeSeriesView(
         origin="/",
         contents=[f"{root}/**" for root in _entities(runs, lambda run: [f"{PLOTS}/{plot.path}"])],
         name=plot.title,
         axis_x=rrb.TimeAxis(link=_LINK),
-        axis_y=rrb.ScalarAxis(range=plot.y_range) if plot.y_range else None,
+        axis_y=rrb.ScalarAxis(range=y_range) if y_range else None,
         plot_legend=rrb.PlotLegend(plot.legend, visible=plot.legend is not None),
     )
 

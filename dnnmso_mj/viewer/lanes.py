@@ -85,9 +85,11 @@ class Lanes:
 
     def end(self, status: str) -> None:
         """The end of the run, which is a state of its first lane where it was not as planned."""
+        gone, words = [self._tick + 1], [GONE]
         if status in ENDS:
-            gone = self._tick + max(1, round(_TAIL * max(self._tick, self._planned)))
-            self._send(self._lanes[0], np.array([self._tick, gone]), [status, GONE])
+            tail = max(1, round(_TAIL * max(self._tick, self._planned)))
+            gone, words = [self._tick, self._tick + tail], [status, GONE]
+        self._send(self._lanes[0], np.array(gone), words)
 
     def _send(self, lane: Lane, ticks: Array, words: list[str]) -> None:
         if len(ticks):
