@@ -1,9 +1,12 @@
-"""What a plot is made of: named, coloured lines over the columns of a run, and levels."""
+"""What a plot is made of: named, coloured lines over the columns of a run, and levels.
+
+The builders at the end give lines of joints and of layers the same colours in all plots.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -27,6 +30,7 @@ JOINT_COLORS: tuple[Rgb, ...] = (
 WHITE: Rgb = (235, 235, 235)
 GREY: Rgb = (150, 150, 150)
 RED: Rgb = (235, 70, 70)
+_FIRST_LAYER, _LAST_LAYER = np.array([240, 110, 210]), np.array([250, 230, 90])
 THIN, NORMAL, BROAD = 1.0, 1.5, 4.0  # points; a broad line is seen on both sides of one over it
 
 
@@ -119,3 +123,32 @@ def log10(values: Values) -> Values:
         return out
 
     return logarithm
+
+
+def log_plot(path: str, title: str, lines: tuple[Line, ...], legend: Corner | None = None) -> Plot:
+    """A plot of logarithms."""
+    return Plot(path, title, lines, pixel="largest", legend=legend)
+
+
+def joints(label: str, n: int, values: Callable[[int], Values]) -> tuple[Line, ...]:
+    """A line for each joint, in the joints' colours; `label` with {} for the joint's number."""
+    return tuple(
+        Line(label.format(j + 1), values(j), joint_color(j), place=place)
+        for j, place in enumerate(places(n))
+    )
+
+
+def pale(lines: tuple[Line, ...]) -> tuple[Line, ...]:
+    """The lines broad and in lighter colours, to lie under others."""
+    return tuple(
+        replace(line, color=lighter(line.color), width=BROAD, role="context") for line in lines
+    )
+
+
+def layers(count: int, values: Callable[[int], Values]) -> tuple[Line, ...]:
+    """A line for each weight layer, from pink to yellow."""
+    lines = []
+    for k, place in enumerate(places(count)):
+        color = ((1.0 - place) * _FIRST_LAYER + place * _LAST_LAYER).astype(int).tolist()
+        lines.append(Line(f"layer {k + 1}", values(k), tuple(color), place=place))
+    return tuple(lines)

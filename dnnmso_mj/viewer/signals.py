@@ -9,7 +9,6 @@ character that it has not (ᵀ, for one).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -37,22 +36,21 @@ from dnnmso_mj.viewer.plot import (
     RED,
     THIN,
     WHITE,
-    Corner,
     Level,
     Line,
     Plot,
-    Values,
     difference,
     distance,
     entry,
     joint_color,
-    lighter,
+    joints,
+    layers,
     log10,
-    places,
+    log_plot,
+    pale,
     scalar,
 )
 
-_FIRST_LAYER, _LAST_LAYER = np.array([240, 110, 210]), np.array([250, 230, 90])
 _HALVES = (("acceleration", "accelerations", "rad/s²"), ("velocity", "velocities", "rad/s"))
 
 
@@ -82,9 +80,9 @@ def learns(scenario: Scenario, layout: StepLayout) -> bool:
 
 def _tracking(scenario: Scenario) -> list[Plot]:
     n = scenario.n_joints
-    torque = _joints("τ{}", n, partial(entry, "tau"))
+    torque = joints("τ{}", n, partial(entry, "tau"))
     if _drives_err(scenario.imperfections):
-        torque = (*_pale(_joints("commanded", n, partial(entry, "tau_cmd"))), *torque)
+        torque = (*pale(joints("commanded", n, partial(entry, "tau_cmd"))), *torque)
     limits = _torque_limits(scenario)
     most = 1.25 * max((level.value for level in limits), default=0.0)
     error, velocity_error = partial(difference, "q", "q_ref"), partial(difference, "qd", "qd_ref")
@@ -96,8 +94,8 @@ def _tracking(scenario: Scenario) -> list[Plot]:
             legend="RightTop",
         ),
         Plot("velocities", "Joint velocities (rad/s)", _against_reference(scenario, "qd")),
-        _log_plot("error_log", "Tracking error |q − q_ref| (log₁₀ of rad)", _errors(n)),
-        Plot("error", "Tracking error q − q_ref (rad)", _joints("e{}", n, error)),
+        log_plot("error_log", "Tracking error |q − q_ref| (log₁₀ of rad)", _errors(n)),
+        Plot("error", "Tracking error q − q_ref (rad)", joints("e{}", n, error)),
         Plot(
             "torque",
             "Torque (N·m)",
@@ -109,7 +107,7 @@ def _tracking(scenario: Scenario) -> list[Plot]:
         Plot(
             "velocity_error",
             "Velocity error q̇ − q̇_ref (rad/s)",
-            _joints("ė{}", n, velocity_error),
+            joints("ė{}", n, velocity_error),
         ),
     ]
 
@@ -127,18 +125,18 @@ def _learning(scenario: Scenario, layout: StepLayout) -> list[Plot]:
         )
     ]
     title = "Knowledge error: distance of f true and learned (log₁₀)"
-    plots.append(_log_plot("knowledge", title, tuple(f_err), legend="RightTop"))
+    plots.append(log_plot("knowledge", title, tuple(f_err), legend="RightTop"))
     if hasattr(scenario.controller, "observer"):
-        angles = _joints("angles", n, lambda j: log10(entry("e_obs", j)))
-        velocities = _joints("velocities", n, lambda j: log10(entry("e_obs", n + j)))
+        angles = joints("angles", n, lambda j: log10(entry("e_obs", j)))
+        velocities = joints("velocities", n, lambda j: log10(entry("e_obs", n + j)))
         title = "Observer error |x − x̂| (log₁₀ of rad, rad/s)"
-        lines = (*_pale(angles), *velocities)
-        plots.append(_log_plot("observer", title, lines, legend="RightTop"))
+        lines = (*pale(angles), *velocities)
+        plots.append(log_plot("observer", title, lines, legend="RightTop"))
     if layout.n_layers:
-        norms = _layers(layout, partial(entry, "weight_norm"))
-        ratios = _layers(layout, lambda k: log10(entry("update_ratio", k)))
+        norms = layers(layout.n_layers, partial(entry, "weight_norm"))
+        ratios = layers(layout.n_layers, lambda k: log10(entry("update_ratio", k)))
         plots.append(Plot("weight_norm", "Weight norm ‖W‖", norms, legend="RightTop"))
-        plots.append(_log_plot("update_ratio", "Update ratio ‖ΔW‖/‖W‖ (log₁₀)", ratios))
+        plots.append(log_plot("update_ratio", "Update ratio ‖ΔW‖/‖W‖ (log₁₀)", ratios))
     return plots
 
 
@@ -152,10 +150,10 @@ def _learns_velocities(scenario: Scenario) -> bool:
 def _dynamics(path: str, what: str, unit: str, rows: slice) -> Plot:
     """The true rows of f, and the learned ones over them."""
     n, first = rows.stop - rows.start, rows.start
-    true = _joints("true", n, lambda j: entry("f_true", first + j))
-    learned = _joints("learned", n, lambda j: entry("f_hat", first + j))
+    true = joints("true", n, lambda j: entry("f_true", first + j))
+    learned = joints("learned", n, lambda j: entry("f_hat", first + j))
     title = f"Dynamics f, true and learned: {what} ({unit})"
-    return Plot(path, title, (*_pale(true), *learned), legend="RightTop")
+    return Plot(path, title, (*pale(true), *learned), legend="RightTop")
 
 
 def _network_theory(scenario: Scenario, layout: StepLayout) -> list[Plot]:
@@ -167,17 +165,17 @@ def _network_theory(scenario: Scenario, layout: StepLayout) -> list[Plot]:
         eta = (Level("η in use", controller.madam.eta, WHITE),)
     trust = (
         Line("deep relative trust", log10(scalar("drt_bound")), WHITE, BROAD, role="context"),
-        *_layers(layout, lambda k: log10(entry("gradient_change", k))),
+        *layers(layout.n_layers, lambda k: log10(entry("gradient_change", k))),
     )
     return [
         Plot(
             "theorem_1",
             "Theorem 1: what η must be below",
-            _layers(layout, partial(entry, "eta_bound")),
+            layers(layout.n_layers, partial(entry, "eta_bound")),
             eta,
             legend="RightTop",
         ),
-        _log_plot("relative_trust", "Relative change of the gradient (log₁₀)", trust, "RightTop"),
+        log_plot("relative_trust", "Relative change of the gradient (log₁₀)", trust, "RightTop"),
     ]
 
 
@@ -196,8 +194,8 @@ def _loop_theory(scenario: Scenario) -> list[Plot]:
     title = "Tracking error and its bounds (log₁₀ of rad)"
     lyapunov = Line("L", log10(scalar("lyapunov")), WHITE)
     return [
-        _log_plot("lyapunov", "Lyapunov function L = ‖e_r‖² (log₁₀)", (lyapunov,)),
-        _log_plot("bounds", title, (*lines, *_errors(n)), legend="RightTop"),
+        log_plot("lyapunov", "Lyapunov function L = ‖e_r‖² (log₁₀)", (lyapunov,)),
+        log_plot("bounds", title, (*lines, *_errors(n)), legend="RightTop"),
     ]
 
 
@@ -236,22 +234,18 @@ def _tip(scene: Scene) -> Plot:
         return np.asarray(np.linalg.norm(between, axis=1))
 
     line = Line("tip", log10(away), joint_color(0))
-    return _log_plot("tip", "Distance of the tip from where it should be (log₁₀ of m)", (line,))
-
-
-def _log_plot(path: str, title: str, lines: tuple[Line, ...], legend: Corner | None = None) -> Plot:
-    return Plot(path, title, lines, pixel="largest", legend=legend)
+    return log_plot("tip", "Distance of the tip from where it should be (log₁₀ of m)", (line,))
 
 
 def _against_reference(scenario: Scenario, name: str) -> tuple[Line, ...]:
     """The reference, what was measured where that is not the true value, and the true value."""
     n, symbol = scenario.n_joints, {"q": "q", "qd": "q̇"}[name]
-    desired = _pale(_joints("desired", n, partial(entry, f"{name}_ref")))
+    desired = pale(joints("desired", n, partial(entry, f"{name}_ref")))
     lines = tuple(replace(line, role="shared") for line in desired)
     if _sensors_err(scenario.imperfections):
-        measured = _joints("measured", n, partial(entry, f"{name}_meas"))
+        measured = joints("measured", n, partial(entry, f"{name}_meas"))
         lines += tuple(replace(line, color=GREY, width=THIN, role="context") for line in measured)
-    return lines + _joints(symbol + "{}", n, partial(entry, name))
+    return lines + joints(symbol + "{}", n, partial(entry, name))
 
 
 def _sensors_err(imperfections: Imperfections) -> bool:
@@ -275,30 +269,7 @@ def _drives_err(imperfections: Imperfections) -> bool:
 
 
 def _errors(n: int) -> tuple[Line, ...]:
-    return _joints("|e{}|", n, lambda j: log10(difference("q", "q_ref", j)))
-
-
-def _joints(label: str, n: int, values: Callable[[int], Values]) -> tuple[Line, ...]:
-    """A line for each joint, in the joints' colours; `label` with {} for the joint's number."""
-    return tuple(
-        Line(label.format(j + 1), values(j), joint_color(j), place=place)
-        for j, place in enumerate(places(n))
-    )
-
-
-def _pale(lines: tuple[Line, ...]) -> tuple[Line, ...]:
-    """The lines broad and in lighter colours, to lie under others."""
-    return tuple(
-        replace(line, color=lighter(line.color), width=BROAD, role="context") for line in lines
-    )
-
-
-def _layers(layout: StepLayout, values: Callable[[int], Values]) -> tuple[Line, ...]:
-    lines = []
-    for k, place in enumerate(places(layout.n_layers)):
-        color = ((1.0 - place) * _FIRST_LAYER + place * _LAST_LAYER).astype(int).tolist()
-        lines.append(Line(f"layer {k + 1}", values(k), tuple(color), place=place))
-    return tuple(lines)
+    return joints("|e{}|", n, lambda j: log10(difference("q", "q_ref", j)))
 
 
 def _torque_limits(scenario: Scenario) -> tuple[Level, ...]:
