@@ -37,6 +37,7 @@ from dnnmso_mj.viewer.process import (
     picture,
     rerun,
 )
+from dnnmso_mj.viewer.summary import drawable
 
 Logs = Path | Sequence[Path]
 
@@ -182,9 +183,12 @@ def run_names(logs: Sequence[Path]) -> list[str]:
     Args:
         logs: one or more; the same may be there twice.
     """
-    names = [log.stem for log in logs]
-    in_folders = [f"{log.resolve().parent.name}/{log.stem}" for log in logs]
-    names = [f if names.count(n) > 1 else n for n, f in zip(names, in_folders, strict=True)]
+    names = []
+    for log in logs:
+        stem = log.stem
+        folders = {other.resolve().parent for other in logs if other.stem == stem}
+        name = f"{log.resolve().parent.name}/{stem}" if len(folders) > 1 else stem
+        names.append(drawable(name))
     before = [names[:k].count(name) for k, name in enumerate(names)]
     return [f"{name} ({k + 1})" if k else name for name, k in zip(names, before, strict=True)]
 

@@ -230,4 +230,6 @@ def test_more_than_eight_are_refused(tmp_path: Path) -> None:
 def test_names_of_runs_are_told_apart() -> None:
     paths = [Path(p) for p in ("/x/paper.mcap", "/y/paper.mcap", "/x/pd.mcap", "/x/pd.mcap")]
     assert run_names(paths[:1]) == ["paper"]
-    assert run_names(paths) == ["x/paper", "y/paper", "x/pd", "x/pd (2)"]
+    assert run_names(paths) == ["x/paper", "y/paper", "pd", "pd (2)"]
+    # What the viewer's font has not would end it.
+    assert run_names([Path("/x/a\u1d40.mcap"), Path("/x/a\u2713.mcap")]) == ["a?", "a? (2)"]

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 SIZE = (1200, 700)
 LEFT = 300  # px, the width of the arm's column
 TRAIL = (255, 220, 90)
-AT_LIMIT = (176, 98, 16)  # the viewer draws bands darker than it is told
+AT_LIMIT = (172, 141, 0)  # the viewer draws bands darker than it is told
 BLUE, ORANGE = JOINT_COLORS[:2]
 WHITE = (235, 235, 235)
 # Tab -> colours that each of its columns of plots must show, from left to right.

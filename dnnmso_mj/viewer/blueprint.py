@@ -19,7 +19,7 @@ WEIGHTS, RATIOS = "weights", "weight_ratios"
 _PANEL = 740.0  # height of a tab in pixels, about
 _LANE, _LANES_HEAD = 41.0, 22.0  # pixels
 _ABREAST = 5  # so many pictures stand side by side
-_MOST_LANES = 6  # more are scrolled to
+_MOST_LANES = 6  # more must do with the room of so many
 _LINK = rrb.components.LinkAxis.LinkToGlobal
 
 View = rrb.View | rrb.Container

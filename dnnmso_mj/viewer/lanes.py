@@ -17,7 +17,7 @@ from dnnmso_mj.viewer.stamps import stamps
 GONE = ""  # the viewer's word for a gap
 GOOD: Rgb = (46, 110, 70)
 BAD: Rgb = (200, 60, 60)
-_ORANGE, _BLUE, _VIOLET, _YELLOW = (225, 125, 20), (50, 105, 180), (120, 85, 180), (150, 125, 40)
+_YELLOW, _BLUE, _VIOLET, _TEAL = (220, 180, 0), (50, 105, 180), (120, 85, 180), (30, 135, 135)
 ENDS = {"diverged": BAD, "failed": BAD, "interrupted": (110, 110, 110), "unfinished": BAD}
 _TAIL = 0.03  # of the run: how long its end is shown where that was not as planned
 
@@ -101,7 +101,7 @@ class Lanes:
 
 def lanes(scenario: Scenario, running: Rgb = GOOD) -> list[Lane]:
     """The bands of a scenario: how the run goes, and one for each kind of event that it has."""
-    words, colors = ("running", "torque limit", "deadline missed"), (running, _ORANGE, RED)
+    words, colors = ("running", "torque limit", "deadline missed"), (running, _YELLOW, RED)
     made = [Lane("run", words, colors, _run)]
     kinds = {type(event) for event in scenario.events}
     if Freeze in kinds:
@@ -152,7 +152,7 @@ def _pushes(scenario: Scenario) -> Lane:
         acting: Array = begun > np.searchsorted(ends, ticks, side="right")
         return acting.astype(int)
 
-    return Lane("push", (GONE, "push"), (GOOD, _YELLOW), states)
+    return Lane("push", (GONE, "push"), (GOOD, _TEAL), states)
 
 
 def _ticks(times: list[float], scenario: Scenario) -> Array:
