@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dnnmso_mj.cli.shared import Json, Overrides, near, print_table, progress_bar, working
+from dnnmso_mj.cli.shared import (
+    Json,
+    Overrides,
+    Trust,
+    near,
+    print_table,
+    progress_bar,
+    working,
+)
 
 if TYPE_CHECKING:
     from dnnmso_mj.audit.run import Audit
@@ -33,6 +41,7 @@ def audit(
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Runs at once; default all cores.")
     ] = None,
+    trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Freeze the weights, drive on, drive elsewhere: how much of the plant does the model know?"""
@@ -46,7 +55,8 @@ def audit(
 
     names = [name.strip() for name in controllers.split(",")] if controllers else []
     with working("checking every controller"):
-        plan = plan_audit(scenario, names, _numbers(at), parse_seeds(seeds), overrides or ())
+        times, numbers = _numbers(at), parse_seeds(seeds)
+        plan = plan_audit(scenario, names, times, numbers, overrides or (), trust=trust)
     with progress_bar(f"audit of {plan.name}", len(plan.subjects) * len(plan.seeds)) as progress:
         found = run_audit(plan, jobs, progress)
     folder = out or logs_dir()

@@ -14,6 +14,7 @@ from dnnmso_mj.cli.shared import (
     DIVERGED,
     Json,
     Overrides,
+    Trust,
     near,
     number,
     print_table,
@@ -53,6 +54,7 @@ def run(
         bool, typer.Option("--real-time", help="Keep to the wall clock, one tick each dt.")
     ] = False,
     plot: Annotated[bool, typer.Option(help="Draw the figures beside the log.")] = True,
+    trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Run a scenario headless: log, figures, summary."""
@@ -61,7 +63,7 @@ def run(
     from dnnmso_mj.timing import timing
 
     sets = [*(overrides or []), *([] if seed is None else [f"seed={seed}"])]
-    loaded = load_scenario(scenario, sets)
+    loaded = load_scenario(scenario, sets, trust=trust)
     try:
         with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
             done = run_logged(loaded, out, force=force, real_time=real_time, progress=progress)
@@ -70,7 +72,7 @@ def run(
     except RunInterrupted as stop:
         ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
         raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
-    figures, undrawn = _draw(done) if plot else ([], None)
+    figures, undrawn = draw(done) if plot else ([], None)
     info = done.trace.info
     if as_json:
         print(json.dumps({
@@ -85,7 +87,7 @@ def run(
             **({"real_time": asdict(timing(done.trace))} if real_time else {}),
         }))  # fmt: skip
     else:
-        _print_summary(done.trace, done.log, figures)
+        print_summary(done.trace, done.log, figures)
         if real_time:
             _print_timing(timing(done.trace))
     if undrawn is not None:
@@ -95,7 +97,7 @@ def run(
         raise typer.Exit(DIVERGED)
 
 
-def _draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
+def draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
     """The figures beside the log, and why there are none of those that could not be written."""
     if len(done.trace) == 0:
         return [], None
@@ -108,7 +110,8 @@ def _draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
         return [], error
 
 
-def _print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
+def print_summary(trace: Trace, log: Path, figures: list[Path], since: int = 0) -> None:
+    """Metrics, speed and files of a run, of which the ticks from `since` on were simulated now."""
     from rich.table import Table
 
     info = trace.info
@@ -119,7 +122,7 @@ def _print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
     for name, value in info.metrics.items():
         table.add_row(name, number(value), UNITS.get(name, ""))
     print_table(table, soft_wrap=True)
-    simulated = len(trace) * trace.scenario.dt
+    simulated = (len(trace) - since) * trace.scenario.dt
     print(f"{simulated:g} s simulated in {info.wall_s:.2f} s")
     print(f"log      {near(log)}")
     for figure in figures:

@@ -13,7 +13,7 @@ import typer
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dnnmso_mj.simulate import Progress
+    from dnnmso_mj.simulation import Progress
     from dnnmso_mj.sweep.statistics import Spread
 
 DIVERGED = 1
@@ -29,6 +29,9 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change a key, e.g. plant.gravity=1.62."),
 ]
+Trust = Annotated[
+    bool, typer.Option("--trust", help="Run code that the scenario names (keys `python`).")
+]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
 
 
@@ -41,8 +44,11 @@ def working(what: str) -> AbstractContextManager[object]:
 
 
 @contextmanager
-def progress_bar(name: str, total: int) -> Iterator[Progress]:
-    """A bar on standard error, when that is a terminal; it takes the number of new steps."""
+def progress_bar(name: str, total: int | None) -> Iterator[Progress]:
+    """A bar on standard error, when that is a terminal; it takes the number of new steps.
+
+    Without a total (None) it says only that something goes on.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
     from rich.progress import TimeRemainingColumn as TimeColumn

@@ -21,6 +21,7 @@ from dnnmso_mj.cli.shared import (
     Overrides,
     Resume,
     ScenarioName,
+    Trust,
     near,
     number,
     print_table,
@@ -58,6 +59,7 @@ def tune(
     jobs: Jobs = None,
     resume: Resume = False,
     force: Force = False,
+    trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Search for a controller's best settings; the winner is a file for `controller: {from: …}`."""
@@ -76,6 +78,7 @@ def tune(
         sets=overrides or (),
         objective=Objective(chatter_scale, max_peak, max_chatter),
         test_seeds=() if test_seeds is None else parse_seeds(test_seeds),
+        trust=trust,
         command=shlex.join(["dnnmso", *sys.argv[1:]]),
     )
     where = storage or default_storage(out)
