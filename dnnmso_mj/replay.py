@@ -1,11 +1,14 @@
-"""A log in the Rerun viewer: as a file, in a window, in a browser, or as a picture."""
+"""Logs in the Rerun viewer: as a file, in a window, in a browser, or as a picture.
+
+Every function takes one log, or a sequence of up to eight to compare in one viewer.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from mcap.records import Attachment
@@ -17,6 +20,7 @@ from dnnmso_mj.plant import Mjcf, build_spec, compile_spec
 from dnnmso_mj.reading import read_snapshots, read_trace
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
+from dnnmso_mj.viewer.plot import TIMELINE
 from dnnmso_mj.viewer.process import (
     check_display,
     check_rerun,
@@ -26,34 +30,39 @@ from dnnmso_mj.viewer.process import (
     rerun,
     until_interrupted,
 )
-from dnnmso_mj.viewer.stamps import TIMELINE
+from dnnmso_mj.viewer.summary import drawable
 from dnnmso_mj.viewer.web import web_server
 
+Logs = Path | Sequence[Path]
 
-def save_rrd(log: Path, out: Path, first_tab: str = "Tracking") -> Path:
-    """Convert a log to a Rerun recording that carries its own layout.
+
+def save_rrd(
+    logs: Logs, out: Path, first_tab: str = "Tracking", *, side_by_side: bool = False
+) -> Path:
+    """Convert logs to a Rerun recording that carries its own layout.
 
     Args:
-        log: an MCAP log, complete or torn.
+        logs: MCAP logs, complete or torn, of robots with as many joints.
         out: the .rrd to write; an existing one is replaced once the new one is whole.
-        first_tab: the tab of plots that is open at first: Tracking, Motion, Learning (of a run
-            with a network), Theory or Timing.
+        first_tab: the tab of plots that is open at first: Tracking, Learning (of a controller that
+            learns), Theory, Timing or Scene.
+        side_by_side: whether the arms of several logs stand beside one another.
 
     Returns:
         `out`.
 
     Raises:
-        LogError: the log cannot be read, has no such tab, or `out` cannot be written; nothing is
-            left behind.
+        LogError: a log cannot be read or shown with the others, has no such tab, or `out` cannot
+            be written; nothing is left behind.
         MissingExtraError: rerun is not installed.
     """
     with _replacing(out, ".rrd") as partial:
-        _convert(log, partial, first_tab)
+        _convert(_several(logs), partial, first_tab, side_by_side)
     return out
 
 
-def open_viewer(log: Path) -> None:
-    """Show a log in the native viewer, until its window is closed or Ctrl-C.
+def open_viewer(logs: Logs, first_tab: str = "Tracking", *, side_by_side: bool = False) -> None:
+    """Show logs in the native viewer, until its window is closed or Ctrl-C.
 
     Raises:
         DnnmsoError: there is no display, or the viewer cannot start.
@@ -64,18 +73,21 @@ def open_viewer(log: Path) -> None:
     )
     with (
         until_interrupted(),
-        _converted(log) as (rrd, _),
+        _converted(logs, first_tab, side_by_side) as (rrd, _),
         rerun("--port", str(free_port()), str(rrd)) as viewer,
     ):
         viewer.wait()
 
 
-def serve(log: Path, port: int = 9090) -> None:
-    """Show a log to browsers on this machine, and to no others, until Ctrl-C.
+def serve(
+    logs: Logs, port: int = 9090, first_tab: str = "Tracking", *, side_by_side: bool = False
+) -> None:
+    """Show logs to browsers on this machine, and to no others, until Ctrl-C.
 
     Args:
-        log: an MCAP log.
+        logs: MCAP logs.
         port: of the web page, whose address is printed on standard output.
+        first_tab, side_by_side: as in `save_rrd`.
 
     Raises:
         DnnmsoError: the port is taken, or the server cannot start.
@@ -83,7 +95,7 @@ def serve(log: Path, port: int = 9090) -> None:
     """
     with (
         until_interrupted(),
-        _converted(log) as (rrd, _),
+        _converted(logs, first_tab, side_by_side) as (rrd, _),
         web_server(port, str(rrd)) as server,
     ):
         print(server.page, flush=True)
@@ -92,21 +104,23 @@ def serve(log: Path, port: int = 9090) -> None:
 
 
 def screenshot(
-    log: Path,
+    logs: Logs,
     png: Path,
     *,
     t: float | None = None,
     tab: str = "Tracking",
     size: tuple[int, int] = (1600, 900),
+    side_by_side: bool = False,
 ) -> Path:
     """Draw the viewer's window to a file, without a display.
 
     Args:
-        log: an MCAP log.
+        logs: MCAP logs.
         png: the picture to write; an existing one is replaced once the new one is whole.
         t: simulated time to show (s); the end of the run by default.
         tab: the tab of plots to show, as `first_tab` of `save_rrd`.
         size: width and height (pixels).
+        side_by_side: as in `save_rrd`.
 
     Returns:
         `png`.
@@ -115,7 +129,10 @@ def screenshot(
         MissingExtraError: rerun is not installed, or the system has no Vulkan driver.
         LogError, DnnmsoError: as `save_rrd`; or the run has no time t; or a view shows nothing.
     """
-    with _replacing(png, ".png") as partial, _converted(log, tab) as (rrd, end):
+    with (
+        _replacing(png, ".png") as partial,
+        _converted(logs, tab, side_by_side) as (rrd, end),
+    ):
         if t is not None and not 0.0 <= t <= end:
             raise DnnmsoError(f"t = {t} s; allowed: 0 to {end:g} s, the end of the run")
         with headless_viewer(rrd, size) as client:
@@ -124,14 +141,38 @@ def screenshot(
     return png
 
 
-def _convert(log: Path, out: Path, first_tab: str) -> float:
-    """Write the recording of a log; returns the time of the run's last tick (s)."""
-    check_rerun()
-    from dnnmso_mj.viewer.rrd import rrd_bytes
+def _several(logs: Logs) -> Sequence[Path]:
+    return [logs] if isinstance(logs, Path) else logs
 
-    trace = read_trace(log)
-    out.write_bytes(rrd_bytes(trace, _scene(log, trace.scenario), first_tab, read_snapshots(log)))
-    return float(trace["t"][-1])
+
+def _convert(logs: Sequence[Path], out: Path, first_tab: str, side_by_side: bool) -> float:
+    """Write the recording of some logs; returns the last time in it (s)."""
+    check_rerun()
+    from dnnmso_mj.viewer.rrd import Run, rrd_bytes
+
+    runs = []
+    for name, log in zip(run_names(logs), logs, strict=True):
+        trace = read_trace(log)
+        runs.append(Run(name, trace, _scene(log, trace.scenario), read_snapshots(log)))
+    out.write_bytes(rrd_bytes(runs, first_tab, side_by_side=side_by_side))
+    last_ticks = [float(run.trace["t"][-1]) for run in runs]
+    return max([*last_ticks, *(snapshot.t for run in runs for snapshot in run.snapshots)])
+
+
+def run_names(logs: Sequence[Path]) -> list[str]:
+    """A name for each log that no other has: its file's, with its folder's or a number if need be.
+
+    Args:
+        logs: one or more; the same may be there twice.
+    """
+    names = []
+    for log in logs:
+        stem = log.stem
+        folders = {other.resolve().parent for other in logs if other.stem == stem}
+        name = f"{log.resolve().parent.name}/{stem}" if len(folders) > 1 else stem
+        names.append(drawable(name))
+    before = [names[:k].count(name) for k, name in enumerate(names)]
+    return [f"{name} ({k + 1})" if k else name for name, k in zip(names, before, strict=True)]
 
 
 def _scene(log: Path, scenario: Scenario) -> Scene:
@@ -152,12 +193,13 @@ def _scene(log: Path, scenario: Scenario) -> Scene:
 
 
 @contextlib.contextmanager
-def _converted(log: Path, first_tab: str = "Tracking") -> Iterator[tuple[Path, float]]:
-    """A log's recording in a temporary file, and its last time (s)."""
+def _converted(logs: Logs, first_tab: str, side_by_side: bool) -> Iterator[tuple[Path, float]]:
+    """The recording of some logs in a temporary file, and the last time in it (s)."""
+    several = _several(logs)
     with tempfile.TemporaryDirectory(prefix="dnnmso-") as folder:
-        rrd = Path(folder) / f"{log.stem}.rrd"
+        rrd = Path(folder) / f"{several[0].stem}.rrd"
         try:
-            end = _convert(log, rrd, first_tab)
+            end = _convert(several, rrd, first_tab, side_by_side)
         except OSError as error:
             raise unwritable(rrd, error) from error
         yield rrd, end

@@ -51,14 +51,13 @@ class ArmPicture:
         self._recording = recording
         self._scene = scene
         self._look = look
-        self._reach = _reach(scene)
+        self._reach = scene.reach
         self._stride = _stride(scenario)
         self._trail = f"{root}{TRAIL}/actual"
         self._roots = [root + name for name in (ARM, DESIRED, TRAIL)]
         self._frames = _frames(scene, self._roots[0])
         self._ghost_frames = _frames(scene, self._roots[1])
         self._path = _desired_path(scenario, scene)
-        self._start = scene.tip(np.array([scenario.initial.q]))
         self._last_tip: Array | None = None
 
     def begin(self) -> None:
@@ -70,7 +69,7 @@ class ArmPicture:
         for geom in scene.geoms:
             rgba = _rgba(geom, self._look.color)
             _log_shape(recording, self._frames[geom.body], geom, rgba)
-            if geom.body != WORLD and self._look.desired:
+            if geom.body != WORLD and self._look.ghost:
                 place = self._ghost_frames[geom.body]
                 _log_shape(recording, place, geom, GHOST_RGBA, GHOST_SCALE)
         for link in scene.links:
@@ -78,7 +77,7 @@ class ArmPicture:
                 pin = _pin(link.joint, 0.02 * reach)
                 recording.log(f"{self._frames[link.name]}/shapes/pin", pin, static=True)
         radius = 0.004 * reach
-        if self._look.desired:
+        if self._look.ghost:
             # Thinner than the trail, which so covers it where the tip has kept to it.
             path = rr.LineStrips3D([self._path], colors=PATH_RGB, radii=0.6 * radius)
             recording.log(f"{self._roots[2]}/desired", path, static=True)
@@ -99,7 +98,7 @@ class ArmPicture:
             return
         times = stamps(t[drawn], ticks[drawn])
         self._send_frames(self._frames, times, q[drawn])
-        if self._look.desired:
+        if self._look.ghost:
             self._send_frames(self._ghost_frames, times, q_ref[drawn])
         # Each stretch at the time it is gone, so that the past makes a trail.
         tip = self._scene.tip(q[drawn])
@@ -109,13 +108,6 @@ class ArmPicture:
         stretches = np.stack([before, tip], axis=1)  # (m, 2, 3)
         self._recording.send_columns(self._trail, times, rr.LineStrips3D.columns(strips=stretches))
 
-    def stage(self) -> tuple[Point, float]:
-        """Centre and half size (m) of what a camera must show, known before the run begins."""
-        points = np.concatenate([np.zeros((1, 3)), self._start, self._path])
-        low, high = points.min(axis=0), points.max(axis=0)
-        x, y, z = map(float, (low + high) / 2 + np.array(self._look.offset))
-        return (x, y, z), max(float((high - low).max()) / 2, 0.4 * self._reach) + 0.1 * self._reach
-
     def _send_frames(
         self, frames: dict[str, str], times: Sequence[rr.TimeColumn], q: Array
     ) -> None:
@@ -124,6 +116,15 @@ class ArmPicture:
             xyz, quaternion = poses[:, k, :3], poses[:, k, 3:]
             columns = rr.Transform3D.columns(translation=xyz, quaternion=quaternion)
             self._recording.send_columns(frames[link.name], times, columns)
+
+
+def stage(scenario: Scenario, scene: Scene) -> tuple[Point, float]:
+    """Centre and half size (m) of what a camera must show, known before a run begins."""
+    start = scene.tip(np.array([scenario.initial.q]))
+    points = np.concatenate([np.zeros((1, 3)), start, _desired_path(scenario, scene)])
+    low, high = points.min(axis=0), points.max(axis=0)
+    x, y, z = map(float, (low + high) / 2)
+    return (x, y, z), max(float((high - low).max()) / 2, 0.4 * scene.reach) + 0.1 * scene.reach
 
 
 def _stride(scenario: Scenario) -> int:
@@ -192,10 +193,3 @@ def _pin(joint: Joint, radius: float) -> rr.AsComponents:
 def _rgba(geom: Geom, color: Rgb | None) -> Rgba:
     red, green, blue, alpha = (round(255 * part) for part in geom.rgba)
     return (*color, alpha) if color else (red, green, blue, alpha)
-
-
-def _reach(scene: Scene) -> float:
-    """How far a point of the robot can be from the origin (m), roughly."""
-    frames = sum(float(np.linalg.norm(link.xyz)) for link in scene.links)
-    shapes = [float(np.linalg.norm(geom.xyz)) + max(geom.size) for geom in scene.geoms]
-    return frames + max(shapes, default=0.0)

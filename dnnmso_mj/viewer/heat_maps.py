@@ -7,10 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 import rerun as rr
 
+from dnnmso_mj.errors import LogError
 from dnnmso_mj.network import network_shape
 from dnnmso_mj.scenario import DnnMsoReplay, LewisNn, Network, RbfMso, Scenario
 from dnnmso_mj.trace import Array
-from dnnmso_mj.viewer.blueprint import CHANGE, WEIGHTS
+from dnnmso_mj.viewer.blueprint import RATIOS, WEIGHTS
 from dnnmso_mj.viewer.stamps import stamps
 
 _SHOWN = 0.99  # of the values lie within the colours' scale; the rest has the last colour
@@ -19,7 +20,7 @@ _COLORS = rr.components.Colormap.CyanToYellow
 
 
 class HeatMaps:
-    """Weights W, and their change log₁₀|W/W₀| where they do not start from zero.
+    """Weights W, and log₁₀|W/W₀| of those that do not start from zero.
 
     The scale of a matrix is that of its largest values so far. It stands beside the pictures and
     not in them, so that all pictures of a matrix have the same.
@@ -31,7 +32,7 @@ class HeatMaps:
     """
 
     def __init__(self, recording: rr.RecordingStream, scenario: Scenario, root: str) -> None:
-        self.names = weight_names(scenario)
+        self.names, self.from_zero = weight_names(scenario)
         self._recording = recording
         self._scenario = scenario
         self._root = root
@@ -39,67 +40,77 @@ class HeatMaps:
         self._scales: dict[str, float] = {}
 
     def send(self, t: float, state: Mapping[str, Array]) -> None:
-        """The matrices in a controller's state at t (s)."""
+        """The matrices in a controller's state at t (s).
+
+        Raises:
+            LogError: the state is not one of this scenario's controller.
+        """
         if not self.names:
             return
         matrices = weight_matrices(self._scenario, state)
         self._first = self._first or matrices
         for name, W, W0 in zip(self.names, matrices, self._first, strict=True):
             self._send(f"{self._root}{WEIGHTS}/{name}", t, W)
-            if W0.any():
-                self._send(f"{self._root}{CHANGE}/{name}", t, change(W0, W))
+            if name not in self.from_zero:
+                self._send(f"{self._root}{RATIOS}/{name}", t, log_ratio(W, W0))
 
     def _send(self, path: str, t: float, values: Array) -> None:
-        scale = float(np.quantile(np.abs(values), _SHOWN))
+        finite = np.abs(values[np.isfinite(values)])  # where a run diverged not all are
+        scale = float(np.quantile(finite, _SHOWN)) if finite.size else 0.0
         if scale > self._scales.get(path, -1.0):
             self._scales[path] = scale
-            limits = [-scale, scale] if scale else [-1.0, 1.0]
             style = rr.DepthImage.from_fields(
-                depth_range=limits, colormap=_COLORS, magnification_filter="nearest"
+                depth_range=[-scale, scale] if scale else [-1.0, 1.0],
+                colormap=_COLORS,
+                magnification_filter="nearest",
             )
             self._recording.log(path, style, static=True)
         picture = _squared(values).astype(np.float32)
-        times = stamps(np.array([t]), np.array([round(t / self._scenario.dt)]))
+        height, width = picture.shape
         columns = rr.DepthImage.columns(
             buffer=[picture.tobytes()],
-            format=[
-                rr.components.ImageFormat(
-                    width=picture.shape[1], height=picture.shape[0], channel_datatype="F32"
-                )
-            ],
+            format=[rr.components.ImageFormat(width, height, channel_datatype="F32")],
         )
+        times = stamps(np.array([t]), np.array([round(t / self._scenario.dt)]))
         self._recording.send_columns(path, times, columns)
 
 
-def weight_names(scenario: Scenario) -> list[str]:
-    """The weight matrices that a controller of this scenario has, from the input on."""
+def weight_names(scenario: Scenario) -> tuple[list[str], set[str]]:
+    """The weight matrices that a controller has, from the input on; those that start from zero."""
     match scenario.controller:
         case LewisNn():
-            return ["V", "W"]
+            return ["V", "W"], {"W"}
         case RbfMso():
-            return ["W"]
+            return ["W"], {"W"}
     network = _network(scenario)
-    return [f"W{k + 1}" for k in range(len(network.hidden) + 1)] if network else []
+    return [f"W{k + 1}" for k in range(len(network.hidden) + 1)] if network else [], set()
 
 
 def weight_matrices(scenario: Scenario, state: Mapping[str, Array]) -> list[Array]:
     """The matrices that `weight_names` names, (outputs, inputs) each, from a controller's state.
 
     Raises:
-        KeyError: the state is not one of this scenario's controller.
+        LogError: the state is not one of this scenario's controller.
     """
-    network = _network(scenario)
-    if network is None:
-        return [state[name].T for name in weight_names(scenario)]
-    flat, n = state["weights"], scenario.n_joints
-    shapes = [network_shape(network, 2 * n, n_out) for n_out in (n, 2 * n)]
-    return next(shape for shape in shapes if shape.n_weights == flat.size).split(flat)
+    network, n = _network(scenario), scenario.n_joints
+    try:
+        if network is None:
+            return [state[name].T for name in weight_names(scenario)[0]]
+        flat = state["weights"]
+    except KeyError as error:
+        kind = scenario.controller.kind
+        raise LogError(f"a snapshot has no {error}; expected what a {kind} learns") from error
+    for n_out in (n, 2 * n):
+        shape = network_shape(network, 2 * n, n_out)
+        if shape.n_weights == flat.size:
+            return shape.split(flat)
+    raise LogError(f"a snapshot has {flat.size} weights; expected those of the scenario's network")
 
 
-def change(before: Array, after: Array) -> Array:
-    """log₁₀|W/W₀| of each weight, 0 where it was or is zero: Madam never changes a sign."""
-    both = (before != 0.0) & (after != 0.0)
-    ratio = np.divide(after, before, out=np.ones_like(after), where=both)
+def log_ratio(W: Array, W0: Array) -> Array:
+    """log₁₀|W/W₀| of each weight, 0 where one is zero. N.B. Madam never changes a sign."""
+    both = (W != 0.0) & (W0 != 0.0)
+    ratio = np.divide(W, W0, out=np.ones_like(W), where=both)
     logarithm: Array = np.log10(np.abs(ratio))
     return logarithm
 

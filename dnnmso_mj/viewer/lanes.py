@@ -10,15 +10,16 @@ import rerun as rr
 
 from dnnmso_mj.scenario import Freeze, Payload, Push, Scenario
 from dnnmso_mj.trace import Array, Trace
-from dnnmso_mj.viewer.plot import RED, Rgb
+from dnnmso_mj.viewer.look import Look
+from dnnmso_mj.viewer.plot import RED, Rgb, darker
 from dnnmso_mj.viewer.stamps import stamps
 
 GONE = ""  # the viewer's word for a gap
 GOOD: Rgb = (46, 110, 70)
 BAD: Rgb = (200, 60, 60)
-_ORANGE, _BLUE, _VIOLET, _YELLOW = (190, 110, 30), (50, 105, 180), (120, 85, 180), (150, 125, 40)
+_YELLOW, _BLUE, _VIOLET, _TEAL = (220, 180, 0), (50, 105, 180), (120, 85, 180), (30, 135, 135)
 ENDS = {"diverged": BAD, "failed": BAD, "interrupted": (110, 110, 110), "unfinished": BAD}
-_TAIL = 0.02  # of the run: how long its end is shown where that was not as planned
+_TAIL = 0.03  # of the run: how long its end is shown where that was not as planned
 
 
 @dataclass(frozen=True)
@@ -45,13 +46,18 @@ class Lanes:
         recording: where to.
         scenario: the experiment.
         root: what the paths of all entities begin with.
+        look: the colour of the run.
     """
 
-    def __init__(self, recording: rr.RecordingStream, scenario: Scenario, root: str) -> None:
+    def __init__(
+        self, recording: rr.RecordingStream, scenario: Scenario, root: str, look: Look
+    ) -> None:
         self._recording = recording
         self._dt = scenario.dt
+        # Beside others the end of a short run must be seen on their axis of time.
+        self._planned = scenario.n_ticks if look.name else 0
         self._root = root
-        self._lanes = lanes(scenario)
+        self._lanes = lanes(scenario, darker(look.color) if look.color else GOOD)
         self.names = [lane.name for lane in self._lanes]
         self._last = dict.fromkeys(self.names, -1)
         self._tick = 0
@@ -79,9 +85,11 @@ class Lanes:
 
     def end(self, status: str) -> None:
         """The end of the run, which is a state of its first lane where it was not as planned."""
+        gone, words = [self._tick + 1], [GONE]
         if status in ENDS:
-            gone = self._tick + max(1, round(_TAIL * self._tick))
-            self._send(self._lanes[0], np.array([self._tick, gone]), [status, GONE])
+            tail = max(1, round(_TAIL * max(self._tick, self._planned)))
+            gone, words = [self._tick, self._tick + tail], [status, GONE]
+        self._send(self._lanes[0], np.array(gone), words)
 
     def _send(self, lane: Lane, ticks: Array, words: list[str]) -> None:
         if len(ticks):
@@ -91,9 +99,10 @@ class Lanes:
             )
 
 
-def lanes(scenario: Scenario) -> list[Lane]:
+def lanes(scenario: Scenario, running: Rgb = GOOD) -> list[Lane]:
     """The bands of a scenario: how the run goes, and one for each kind of event that it has."""
-    made = [Lane("run", ("running", "torque limit", "deadline missed"), (GOOD, _ORANGE, RED), _run)]
+    words, colors = ("running", "torque limit", "deadline missed"), (running, _YELLOW, RED)
+    made = [Lane("run", words, colors, _run)]
     kinds = {type(event) for event in scenario.events}
     if Freeze in kinds:
         made.append(_freezes(scenario))
@@ -143,7 +152,7 @@ def _pushes(scenario: Scenario) -> Lane:
         acting: Array = begun > np.searchsorted(ends, ticks, side="right")
         return acting.astype(int)
 
-    return Lane("push", (GONE, "push"), (GOOD, _YELLOW), states)
+    return Lane("push", (GONE, "push"), (GOOD, _TEAL), states)
 
 
 def _ticks(times: list[float], scenario: Scenario) -> Array:

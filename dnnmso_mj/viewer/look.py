@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dnnmso_mj.viewer.plot import BROAD, Line, Rgb, lighter
+from dnnmso_mj.viewer.plot import Line, Rgb, lighter
 
 Point = tuple[float, float, float]
 
@@ -19,6 +19,7 @@ RUN_COLORS: tuple[Rgb, ...] = (
     (80, 200, 210),
     (235, 130, 200),
 )
+COMMON_COLOR: Rgb = (115, 115, 115)
 
 
 @dataclass(frozen=True)
@@ -26,24 +27,30 @@ class Look:
     """What sets a run apart; by default nothing, as it stands alone.
 
     Args:
-        name: of the run, added to the name of each of its lines.
+        name: of the run, which its lines have in the legend.
         color: of all its lines and of its arm; None: each joint and each layer has its own.
-        desired: whether its desired arm and lines that it has in common with others are shown.
+        shared: whether it shows what it has in common with an earlier run: the desired motion.
+        ghost: whether the desired arm moves with it.
         offset: where its arm stands (m).
     """
 
     name: str = ""
     color: Rgb | None = None
-    desired: bool = True
+    shared: bool = True
+    ghost: bool = True
     offset: Point = (0.0, 0.0, 0.0)
 
-    def label(self, name: str) -> str:
-        """The name of a line in the legend."""
-        return f"{name} · {self.name}" if self.name else name
+    def line_name(self, line: Line) -> str:
+        """What the legend says."""
+        if not self.name or line.role == "shared":
+            return line.name
+        return self.name if line.role == "value" else f"{self.name}, {line.name}"
 
     def line_color(self, line: Line) -> Rgb:
-        """A line's own colour, or the run's: from full to half white over joints and layers."""
+        """A line's own colour, or the run's: lighter from joint to joint, or layer to layer."""
         if self.color is None:
             return line.color
+        if line.role == "shared":
+            return COMMON_COLOR
         shade = lighter(self.color, 0.55 * line.place)
-        return lighter(shade, 0.5) if line.width == BROAD else shade
+        return shade if line.role == "value" else lighter(shade, 0.5)

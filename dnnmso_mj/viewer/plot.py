@@ -1,9 +1,12 @@
-"""What a plot is made of: named, coloured lines over the columns of a run, and levels."""
+"""What a plot is made of: named, coloured lines over the columns of a run, and levels.
+
+The builders at the end give lines of joints and of layers the same colours in all plots.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -14,6 +17,7 @@ Rgb = tuple[int, int, int]
 Corner = Literal["LeftTop", "LeftBottom", "RightTop", "RightBottom"]
 Values = Callable[[Trace], Array]  # a stretch of N ticks -> (N,); a NaN leaves a gap
 
+TIMELINE = "time"  # what every line, pose and event is placed on: simulated time
 JOINT_COLORS: tuple[Rgb, ...] = (
     (66, 150, 250),
     (255, 150, 50),
@@ -26,18 +30,21 @@ JOINT_COLORS: tuple[Rgb, ...] = (
 WHITE: Rgb = (235, 235, 235)
 GREY: Rgb = (150, 150, 150)
 RED: Rgb = (235, 70, 70)
+_FIRST_LAYER, _LAST_LAYER = np.array([240, 110, 210]), np.array([250, 230, 90])
 THIN, NORMAL, BROAD = 1.0, 1.5, 4.0  # points; a broad line is seen on both sides of one over it
 
 
 @dataclass(frozen=True)
 class Line:
-    """One value a tick."""
+    """One value a tick; lines of one name have one entry in the legend."""
 
     name: str
     values: Values
     color: Rgb
     width: float = NORMAL
     place: float = 0.0  # among its like: 0 for the first joint or layer, 1 for the last
+    # What a value is held against is its context; the reference is the same for several runs.
+    role: Literal["value", "context", "shared"] = "value"
 
 
 @dataclass(frozen=True)
@@ -61,7 +68,7 @@ class Plot:
     # What a pixel shows of the many ticks that fall on it. Of a logarithm the low peaks are mere
     # zero crossings. Never the mean: it would hide the peaks of torque and of compute time.
     pixel: Literal["extremes", "largest"] = "extremes"
-    legend: Corner = "RightTop"  # where the lines seldom are
+    legend: Corner | None = None  # None: the lines have the colours of another plot's
 
 
 def joint_color(joint: int) -> Rgb:
@@ -77,6 +84,12 @@ def places(count: int) -> list[float]:
 def lighter(color: Rgb, share: float = 0.6) -> Rgb:
     """A colour with this share of white."""
     red, green, blue = (round((1.0 - share) * c + share * 255) for c in color)
+    return red, green, blue
+
+
+def darker(color: Rgb) -> Rgb:
+    """A colour for white words to stand on; the viewer darkens bands once more."""
+    red, green, blue = (round(0.7 * c) for c in color)
     return red, green, blue
 
 
@@ -96,7 +109,7 @@ def difference(name: str, other: str, k: int) -> Values:
 
 
 def distance(name: str, other: str, entries: slice) -> Values:
-    """‖a − b‖ of some entries of two columns."""
+    """Euclidean distance of two columns in some of their entries."""
     return lambda trace: np.linalg.norm(trace[name][:, entries] - trace[other][:, entries], axis=1)
 
 
@@ -110,3 +123,32 @@ def log10(values: Values) -> Values:
         return out
 
     return logarithm
+
+
+def log_plot(path: str, title: str, lines: tuple[Line, ...], legend: Corner | None = None) -> Plot:
+    """A plot of logarithms."""
+    return Plot(path, title, lines, pixel="largest", legend=legend)
+
+
+def joints(label: str, n: int, values: Callable[[int], Values]) -> tuple[Line, ...]:
+    """A line for each joint, in the joints' colours; `label` with {} for the joint's number."""
+    return tuple(
+        Line(label.format(j + 1), values(j), joint_color(j), place=place)
+        for j, place in enumerate(places(n))
+    )
+
+
+def pale(lines: tuple[Line, ...]) -> tuple[Line, ...]:
+    """The lines broad and in lighter colours, to lie under others."""
+    return tuple(
+        replace(line, color=lighter(line.color), width=BROAD, role="context") for line in lines
+    )
+
+
+def layers(count: int, values: Callable[[int], Values]) -> tuple[Line, ...]:
+    """A line for each weight layer, from pink to yellow."""
+    lines = []
+    for k, place in enumerate(places(count)):
+        color = ((1.0 - place) * _FIRST_LAYER + place * _LAST_LAYER).astype(int).tolist()
+        lines.append(Line(f"layer {k + 1}", values(k), tuple(color), place=place))
+    return tuple(lines)

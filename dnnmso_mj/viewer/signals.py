@@ -9,7 +9,6 @@ character that it has not (ᵀ, for one).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 
@@ -28,8 +27,9 @@ from dnnmso_mj.scenario import (
     expand,
 )
 from dnnmso_mj.scenario.controller import inversion
+from dnnmso_mj.scene import Scene
 from dnnmso_mj.theory import UNDEFINED, build_bounds
-from dnnmso_mj.trace import Array, StepLayout
+from dnnmso_mj.trace import Array, StepLayout, Trace
 from dnnmso_mj.viewer.plot import (
     BROAD,
     GREY,
@@ -39,31 +39,36 @@ from dnnmso_mj.viewer.plot import (
     Level,
     Line,
     Plot,
-    Rgb,
-    Values,
     difference,
     distance,
     entry,
     joint_color,
-    lighter,
+    joints,
+    layers,
     log10,
-    places,
+    log_plot,
+    pale,
     scalar,
 )
 
-_FIRST_LAYER, _LAST_LAYER = np.array([240, 110, 210]), np.array([250, 230, 90])
 _HALVES = (("acceleration", "accelerations", "rad/s²"), ("velocity", "velocities", "rad/s"))
 
 
-def plot_tabs(scenario: Scenario, layout: StepLayout) -> dict[str, list[Plot]]:
-    """Tab name -> its plots; Learning only for a controller that learns the dynamics."""
+def plot_tabs(scenario: Scenario, scene: Scene, layout: StepLayout) -> dict[str, list[Plot]]:
+    """Tab name -> its plots; Learning only for a controller that learns the dynamics.
+
+    Args:
+        scenario: the experiment.
+        scene: the robot.
+        layout: the widths of the run's columns.
+    """
     learning = {"Learning": _learning(scenario, layout)} if learns(scenario, layout) else {}
     return {
         "Tracking": _tracking(scenario),
         **learning,
         "Theory": [*_network_theory(scenario, layout), *_loop_theory(scenario)],
         "Timing": _timing(scenario),
-        "Scene": [],
+        "Scene": [_tip(scene)],
     }
 
 
@@ -75,21 +80,34 @@ def learns(scenario: Scenario, layout: StepLayout) -> bool:
 
 def _tracking(scenario: Scenario) -> list[Plot]:
     n = scenario.n_joints
-    torque = _joints("τ{}", n, partial(entry, "tau"))
+    torque = joints("τ{}", n, partial(entry, "tau"))
     if _drives_err(scenario.imperfections):
-        torque = (*_pale(_joints("τ{} commanded", n, partial(entry, "tau_cmd"))), *torque)
+        torque = (*pale(joints("commanded", n, partial(entry, "tau_cmd"))), *torque)
     limits = _torque_limits(scenario)
+    most = 1.25 * max((level.value for level in limits), default=0.0)
     error, velocity_error = partial(difference, "q", "q_ref"), partial(difference, "qd", "qd_ref")
     return [
-        Plot("joint_angles", "Joint angles (rad)", _against_reference(scenario, "q")),
+        Plot(
+            "joint_angles",
+            "Joint angles (rad)",
+            _against_reference(scenario, "q"),
+            legend="RightTop",
+        ),
         Plot("velocities", "Joint velocities (rad/s)", _against_reference(scenario, "qd")),
-        _log_plot("error_log", "Tracking error |q − q_ref| (log₁₀ of rad)", _errors(n)),
-        Plot("error", "Tracking error q − q_ref (rad)", _joints("e{}", n, error)),
-        Plot("torque", "Torque (N·m)", torque, limits, legend="RightBottom"),
+        log_plot("error_log", "Tracking error |q − q_ref| (log₁₀ of rad)", _errors(n)),
+        Plot("error", "Tracking error q − q_ref (rad)", joints("e{}", n, error)),
+        Plot(
+            "torque",
+            "Torque (N·m)",
+            torque,
+            limits,
+            y_range=(-most, most) if limits else None,  # what is commanded may be far beyond
+            legend="RightBottom",
+        ),
         Plot(
             "velocity_error",
             "Velocity error q̇ − q̇_ref (rad/s)",
-            _joints("ė{}", n, velocity_error),
+            joints("ė{}", n, velocity_error),
         ),
     ]
 
@@ -101,20 +119,24 @@ def _learning(scenario: Scenario, layout: StepLayout) -> list[Plot]:
         del halves[1]
     plots = [_dynamics(f"dynamics_{path}", what, unit, rows) for (path, what, unit), rows in halves]
     f_err = [
-        Line(f"{what} ({unit})", log10(distance("f_true", "f_hat", rows)), color)
-        for ((_, what, unit), rows), color in zip(halves, (WHITE, GREY), strict=False)
+        Line(f"{what} ({unit})", log10(distance("f_true", "f_hat", rows)), color, place=place)
+        for ((_, what, unit), rows), color, place in zip(
+            halves, (WHITE, GREY), (0, 1), strict=False
+        )
     ]
-    plots.append(_log_plot("knowledge", "Knowledge error ‖f − f̂‖ (log₁₀)", tuple(f_err)))
+    title = "Knowledge error: distance of f true and learned (log₁₀)"
+    plots.append(log_plot("knowledge", title, tuple(f_err), legend="RightTop"))
     if hasattr(scenario.controller, "observer"):
-        angles = _joints("q{}", n, lambda j: log10(entry("e_obs", j)))
-        velocities = _joints("q̇{}", n, lambda j: log10(entry("e_obs", n + j)))
-        lines = (*_pale(angles), *velocities)
-        plots.append(_log_plot("observer", "Observer error |x − x̂| (log₁₀ of rad, rad/s)", lines))
+        angles = joints("angles", n, lambda j: log10(entry("e_obs", j)))
+        velocities = joints("velocities", n, lambda j: log10(entry("e_obs", n + j)))
+        title = "Observer error |x − x̂| (log₁₀ of rad, rad/s)"
+        lines = (*pale(angles), *velocities)
+        plots.append(log_plot("observer", title, lines, legend="RightTop"))
     if layout.n_layers:
-        norms = _layers(layout, partial(entry, "weight_norm"))
-        ratios = _layers(layout, lambda k: log10(entry("update_ratio", k)))
-        plots.append(Plot("weight_norm", "Weight norm ‖W‖", norms))
-        plots.append(_log_plot("update_ratio", "Update ratio ‖ΔW‖/‖W‖ (log₁₀)", ratios))
+        norms = layers(layout.n_layers, partial(entry, "weight_norm"))
+        ratios = layers(layout.n_layers, lambda k: log10(entry("update_ratio", k)))
+        plots.append(Plot("weight_norm", "Weight norm ‖W‖", norms, legend="RightTop"))
+        plots.append(log_plot("update_ratio", "Update ratio ‖ΔW‖/‖W‖ (log₁₀)", ratios))
     return plots
 
 
@@ -128,10 +150,10 @@ def _learns_velocities(scenario: Scenario) -> bool:
 def _dynamics(path: str, what: str, unit: str, rows: slice) -> Plot:
     """The true rows of f, and the learned ones over them."""
     n, first = rows.stop - rows.start, rows.start
-    true = _joints("f{} true", n, lambda j: entry("f_true", first + j))
-    learned = _joints("f{} learned", n, lambda j: entry("f_hat", first + j))
+    true = joints("true", n, lambda j: entry("f_true", first + j))
+    learned = joints("learned", n, lambda j: entry("f_hat", first + j))
     title = f"Dynamics f, true and learned: {what} ({unit})"
-    return Plot(path, title, (*_pale(true), *learned))
+    return Plot(path, title, (*pale(true), *learned), legend="RightTop")
 
 
 def _network_theory(scenario: Scenario, layout: StepLayout) -> list[Plot]:
@@ -142,18 +164,18 @@ def _network_theory(scenario: Scenario, layout: StepLayout) -> list[Plot]:
     if isinstance(controller, DnnMso | ClassicalMso) and isinstance(controller.rule, Madam):
         eta = (Level("η in use", controller.madam.eta, WHITE),)
     trust = (
-        Line("deep relative trust", log10(scalar("drt_bound")), WHITE, BROAD),
-        *_layers(layout, lambda k: log10(entry("gradient_change", k))),
+        Line("deep relative trust", log10(scalar("drt_bound")), WHITE, BROAD, role="context"),
+        *layers(layout.n_layers, lambda k: log10(entry("gradient_change", k))),
     )
     return [
         Plot(
             "theorem_1",
             "Theorem 1: what η must be below",
-            _layers(layout, partial(entry, "eta_bound")),
+            layers(layout.n_layers, partial(entry, "eta_bound")),
             eta,
-            legend="RightBottom",
+            legend="RightTop",
         ),
-        _log_plot("relative_trust", "Relative change of the gradient (log₁₀)", trust),
+        log_plot("relative_trust", "Relative change of the gradient (log₁₀)", trust, "RightTop"),
     ]
 
 
@@ -162,7 +184,7 @@ def _loop_theory(scenario: Scenario) -> list[Plot]:
     law = inversion(scenario.controller)
     bounds = build_bounds(law, n, scenario.dt, first_order=False)
     lines = [
-        Line(name, log10(scalar(column)), color)
+        Line(name, log10(scalar(column)), color, role="context")
         for name, column, bound, color in (
             ("bound on |e|", "ultimate_bound", bounds.joint, WHITE),
             ("paper's, on ‖e_r‖", "ultimate_bound_paper", bounds.paper, GREY),
@@ -172,8 +194,8 @@ def _loop_theory(scenario: Scenario) -> list[Plot]:
     title = "Tracking error and its bounds (log₁₀ of rad)"
     lyapunov = Line("L", log10(scalar("lyapunov")), WHITE)
     return [
-        _log_plot("lyapunov", "Lyapunov function L = ‖e_r‖² (log₁₀)", (lyapunov,)),
-        _log_plot("bounds", title, (*lines, *_errors(n))),
+        log_plot("lyapunov", "Lyapunov function L = ‖e_r‖² (log₁₀)", (lyapunov,)),
+        log_plot("bounds", title, (*lines, *_errors(n)), legend="RightTop"),
     ]
 
 
@@ -187,6 +209,7 @@ def _timing(scenario: Scenario) -> list[Plot]:
             (Line("update", scalar("compute_us"), joint_color(0), THIN),),
             (Level("deadline", deadline, RED),),
             y_range=(0.0, 1.2 * deadline),  # the first update compiles, and would hide all others
+            legend="RightTop",
         ),
         Plot(
             "wake_late",
@@ -198,22 +221,31 @@ def _timing(scenario: Scenario) -> list[Plot]:
             "Flags (1 = yes)",
             tuple(Line(name.replace("_", " "), scalar(name), color) for name, color in flags),
             y_range=(-0.1, 1.1),
+            legend="RightTop",
         ),
     ]
 
 
-def _log_plot(path: str, title: str, lines: tuple[Line, ...]) -> Plot:
-    return Plot(path, title, lines, pixel="largest")
+def _tip(scene: Scene) -> Plot:
+    """What the arm's error makes at its tip."""
+
+    def away(trace: Trace) -> Array:
+        between = scene.tip(trace["q"]) - scene.tip(trace["q_ref"])  # (N, 3)
+        return np.asarray(np.linalg.norm(between, axis=1))
+
+    line = Line("tip", log10(away), joint_color(0))
+    return log_plot("tip", "Distance of the tip from where it should be (log₁₀ of m)", (line,))
 
 
 def _against_reference(scenario: Scenario, name: str) -> tuple[Line, ...]:
     """The reference, what was measured where that is not the true value, and the true value."""
     n, symbol = scenario.n_joints, {"q": "q", "qd": "q̇"}[name]
-    lines = _pale(_joints(symbol + "{} ref", n, partial(entry, f"{name}_ref")))
+    desired = pale(joints("desired", n, partial(entry, f"{name}_ref")))
+    lines = tuple(replace(line, role="shared") for line in desired)
     if _sensors_err(scenario.imperfections):
-        measured = _joints(symbol + "{} measured", n, partial(entry, f"{name}_meas"))
-        lines += tuple(replace(line, color=GREY, width=THIN) for line in measured)
-    return lines + _joints(symbol + "{}", n, partial(entry, name))
+        measured = joints("measured", n, partial(entry, f"{name}_meas"))
+        lines += tuple(replace(line, color=GREY, width=THIN, role="context") for line in measured)
+    return lines + joints(symbol + "{}", n, partial(entry, name))
 
 
 def _sensors_err(imperfections: Imperfections) -> bool:
@@ -237,28 +269,7 @@ def _drives_err(imperfections: Imperfections) -> bool:
 
 
 def _errors(n: int) -> tuple[Line, ...]:
-    return _joints("|e{}|", n, lambda j: log10(difference("q", "q_ref", j)))
-
-
-def _joints(label: str, n: int, values: Callable[[int], Values]) -> tuple[Line, ...]:
-    """A line for each joint, in the joints' colours; `label` with {} for the joint's number."""
-    return tuple(
-        Line(label.format(j + 1), values(j), joint_color(j), place=place)
-        for j, place in enumerate(places(n))
-    )
-
-
-def _pale(lines: tuple[Line, ...]) -> tuple[Line, ...]:
-    """The lines broad and in lighter colours, to lie under others."""
-    return tuple(replace(line, color=lighter(line.color), width=BROAD) for line in lines)
-
-
-def _layers(layout: StepLayout, values: Callable[[int], Values]) -> tuple[Line, ...]:
-    lines = []
-    for k, place in enumerate(places(layout.n_layers)):
-        color = ((1.0 - place) * _FIRST_LAYER + place * _LAST_LAYER).astype(int).tolist()
-        lines.append(Line(f"layer {k + 1}", values(k), tuple(color), place=place))
-    return tuple(lines)
+    return joints("|e{}|", n, lambda j: log10(difference("q", "q_ref", j)))
 
 
 def _torque_limits(scenario: Scenario) -> tuple[Level, ...]:
@@ -266,14 +277,11 @@ def _torque_limits(scenario: Scenario) -> tuple[Level, ...]:
     if limit is None:
         return ()
     values = expand(limit, scenario.n_joints)
+    colors = [joint_color(j) for j in range(len(values))]
     if np.all(values == values[0]):
-        return _both_signs("limit", values[:1], [RED])
-    return _both_signs("limit {}", values, map(joint_color, range(len(values))))
-
-
-def _both_signs(label: str, values: Array, colors: Iterable[Rgb]) -> tuple[Level, ...]:
+        values, colors = values[:1], [RED]
     return tuple(
-        Level(sign + label.format(j + 1), factor * float(value), color)
-        for j, (value, color) in enumerate(zip(values, colors, strict=True))
-        for sign, factor in (("+", 1.0), ("−", -1.0))
+        Level("limit", sign * float(value), color)
+        for value, color in zip(values, colors, strict=True)
+        for sign in (1.0, -1.0)
     )

@@ -6,8 +6,8 @@ import numpy as np
 import rerun as rr
 
 from dnnmso_mj.trace import Array
+from dnnmso_mj.viewer.plot import TIMELINE
 
-TIMELINE = "time"  # what every line, pose and event is placed on: simulated time
 TICKS = "tick"
 
 

@@ -6,27 +6,25 @@ that still goes on is shown as its log will be.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import rerun as rr
 
-from dnnmso_mj.errors import LogError
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.trace import Array, Event, RunInfo, StepLayout, Trace
-from dnnmso_mj.viewer.arm_picture import ArmPicture
-from dnnmso_mj.viewer.blueprint import EVENTS, PLOTS, SUMMARY, Shown, replay_blueprint
+from dnnmso_mj.viewer.arm_picture import ArmPicture, stage
+from dnnmso_mj.viewer.blueprint import EVENTS, PLOTS, SUMMARY, Shown, check_tab, replay_blueprint
 from dnnmso_mj.viewer.heat_maps import HeatMaps
 from dnnmso_mj.viewer.lanes import Lanes
 from dnnmso_mj.viewer.look import Look
 from dnnmso_mj.viewer.plot import THIN, Plot
 from dnnmso_mj.viewer.signals import plot_tabs
 from dnnmso_mj.viewer.stamps import stamps
+from dnnmso_mj.viewer.summary import Metrics, drawable, outcome, summary
 
-# Tried out: these and no others are known to be in the viewer's font.
-_NOT_DRAWN = re.compile("[^\n -\u0148\u014a-\u017f\u0300-\u03de–—‘’“”…−‖⁻¹₀₁₂₃→⇒≤≥√∞≈≠∑∫]")
 _PIXEL = {
     "extremes": rr.components.AggregationPolicy.MinMax,
     "largest": rr.components.AggregationPolicy.Max,
@@ -63,12 +61,15 @@ class RunStream:
         self.scenario = scenario
         self._prefix = prefix
         self.look = look or Look()
-        self._tabs = plot_tabs(scenario, layout)
+        self._tabs = plot_tabs(scenario, scene, layout)
         self._heat_maps = HeatMaps(recording, scenario, prefix)
         self._recording = recording
+        self._scene = scene
         self._plots = [plot for plots in self._tabs.values() for plot in plots]
+        if not self.look.shared:
+            self._plots = [_unshared(plot) for plot in self._plots]
         self._arm = ArmPicture(recording, scenario, scene, prefix, self.look)
-        self._lanes = Lanes(recording, scenario, prefix)
+        self._lanes = Lanes(recording, scenario, prefix, self.look)
         self._ticks = 0
 
     def begin(self, first_tab: str = "Tracking") -> None:
@@ -80,7 +81,7 @@ class RunStream:
         Raises:
             LogError: there is no such tab.
         """
-        check_tab(first_tab, self._tabs)
+        check_tab(first_tab, [self.shown])
         recording = self._recording
         # Active at once: served, a mere default is lost at times.
         recording.send_blueprint(replay_blueprint([self.shown], first_tab))
@@ -136,21 +137,24 @@ class RunStream:
 
     def end(self, info: RunInfo) -> None:
         """Send how the run went."""
-        outcome = f"{info.status}: {info.reason}" if info.reason else info.status
         self._lanes.end(info.status)
-        self._send_summary(f"{self._ticks * self.scenario.dt:g} s: {outcome}", info.metrics)
+        how = outcome(info.status, info.reason, self._ticks * self.scenario.dt)
+        self._send_summary(how, info.metrics)
 
     @property
     def shown(self) -> Shown:
         """What there is to lay out."""
-        centre, half_size = self._arm.stage()
+        maps = self._heat_maps
+        centre, half_size = stage(self.scenario, self._scene)
+        x, y, z = (c + offset for c, offset in zip(centre, self.look.offset, strict=True))
         return Shown(
             name=self.look.name,
             prefix=self._prefix,
             tabs=self._tabs,
             lanes=self._lanes.names,
-            matrices=self._heat_maps.names,
-            centre=centre,
+            matrices=maps.names,
+            ratios=[name for name in maps.names if name not in maps.from_zero],
+            centre=(x, y, z),
             half_size=half_size,
         )
 
@@ -160,7 +164,7 @@ class RunStream:
     def _send_styles(self, plot: Plot) -> None:
         """The lines of a plot are one entity, its levels another."""
         style = rr.SeriesLines(
-            names=[self.look.label(line.name) for line in plot.lines],
+            names=[self.look.line_name(line) for line in plot.lines],
             colors=[self.look.line_color(line) for line in plot.lines],
             widths=[line.width for line in plot.lines],
             aggregation_policy=_PIXEL[plot.pixel],
@@ -174,29 +178,14 @@ class RunStream:
             )
             self._recording.log(f"{self._path(plot)}/levels", style, static=True)
 
-    def _send_summary(self, outcome: str, metrics: Mapping[str, object]) -> None:
-        """How the run went, in Markdown."""
-        title = f"**{self.scenario.name}**, seed {self.scenario.seed}, {outcome}"
-        rows = [f"- {name}: {value:.4g}" for name, value in metrics.items() if value is not None]
-        parts = [title, self.scenario.description, "\n".join(rows)]
-        text = drawable("\n\n".join(filter(None, parts)))
+    def _send_summary(self, how: str, metrics: Metrics) -> None:
+        text = summary(self.scenario, how, metrics)
         document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
         self._recording.log(self._prefix + SUMMARY, document, static=True)
 
 
-def check_tab(name: str, tabs: Mapping[str, object]) -> None:
-    """Refuse a tab that there is not.
-
-    Raises:
-        LogError: it is none of these.
-    """
-    if name not in tabs:
-        raise LogError(f"tab {name!r}; this run has: {', '.join(tabs)}")
-
-
-def drawable(text: str) -> str:
-    """Text without the characters that would end a headless viewer; see `signals`."""
-    return _NOT_DRAWN.sub("?", text)
+def _unshared(plot: Plot) -> Plot:
+    return replace(plot, lines=tuple(line for line in plot.lines if line.role != "shared"))
 
 
 def _send_scalars(
