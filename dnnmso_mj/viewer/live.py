@@ -11,6 +11,7 @@ import pickle
 import subprocess
 import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -44,6 +45,7 @@ STREAMER = "dnnmso_mj.viewer.streamer"
 BACKLOG_BYTES = 64 * 2**20  # that may wait for the viewer; what is more is left out
 ROWS, EVENT, SNAPSHOT = range(3)  # kinds of messages
 _START_S = 60.0  # a busy machine starts Python and Rerun well within it
+_SETTLE_S = 1.0  # no longer than the streamer takes to start
 _PATIENCE_S = 3.0  # after the run, with a viewer that takes nothing
 
 
@@ -203,6 +205,9 @@ def started(*arguments: str) -> Iterator[LiveView]:
         viewer.give_way()
         viewer.wait_until(lambda: listens(port), "ready")
         with connected(data_address(port)) as live:
+            # It listens before it has a window, and ends if it can have none.
+            settled = time.monotonic() + _SETTLE_S
+            viewer.wait_until(lambda: time.monotonic() > settled, "ready")
             try:
                 yield live
             finally:
