@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dnnmso_mj.errors import LogError, RunInterrupted
+from dnnmso_mj.interrupts import interrupted_once
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.paths import find_model, logs_dir
 from dnnmso_mj.plant import Mjcf
@@ -56,12 +57,13 @@ def run_logged(
     Raises:
         ScenarioError: the model cannot be used; no log is left behind.
         LogError: the log exists or cannot be written.
-        RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run.
+        RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run. Another Ctrl-C
+            while the log is being ended does nothing.
     """
     mjcf = Mjcf.read(find_model(scenario.plant.model))
     pace = real_time_pace(scenario) if real_time else AS_FAST_AS_CAN_BE
     simulation = Simulation(scenario, mjcf, pace=pace)
-    with _open_log(simulation, mjcf, out, force) as recorder:
+    with interrupted_once() as end, _open_log(simulation, mjcf, out, force) as recorder:
         started = time.perf_counter()
         try:
             with left_in_peace() if real_time else nullcontext() as priority:
@@ -72,7 +74,8 @@ def run_logged(
             wall = time.perf_counter() - started
             info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
             trace = _finish(simulation, recorder, info)
-            raise RunInterrupted(recorder.path, len(trace)) from stop
+            raise RunInterrupted(recorder.path, len(trace), trace) from stop
+        end()
         return LoggedRun(_finish(simulation, recorder, info), recorder.path)
 
 

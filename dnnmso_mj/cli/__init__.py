@@ -14,6 +14,7 @@ from io import TextIOWrapper
 from typing import Annotated, NoReturn
 
 import typer
+from typer.completion import completion_init
 
 from dnnmso_mj import __version__
 from dnnmso_mj.cli import (
@@ -21,6 +22,7 @@ from dnnmso_mj.cli import (
     bench,
     check,
     compare,
+    completion,
     logs,
     margins,
     report,
@@ -31,6 +33,8 @@ from dnnmso_mj.cli import (
 )
 from dnnmso_mj.cli.shared import BAD_INPUT, INTERRUPTED
 from dnnmso_mj.errors import DnnmsoError
+
+COMPLETE = "_DNNMSO_COMPLETE"  # set by a shell that asks for completions
 
 app = typer.Typer(
     help="Run, prove, replay and measure the DNN-MSO controller on a MuJoCo arm.",
@@ -48,6 +52,8 @@ def main() -> NoReturn:
     warnings.showwarning = _Warnings().show
     warnings.simplefilter("always", UserWarning)
     _degrade()
+    if COMPLETE in os.environ:
+        completion_init()
     status = _run()
     try:
         if sys.stdout is not None:
@@ -160,3 +166,4 @@ app.command()(logs.recover)
 app.command()(scenarios.schema)
 app.command()(scenarios.scenarios)
 app.command()(bench.bench)
+app.command()(completion.completion)

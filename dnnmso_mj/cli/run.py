@@ -14,13 +14,15 @@ from dnnmso_mj.cli.shared import (
     DIVERGED,
     Json,
     Overrides,
+    ScenarioName,
     near,
     number,
     print_table,
     progress_bar,
     working,
 )
-from dnnmso_mj.errors import DnnmsoError, RunInterrupted, ScenarioError
+from dnnmso_mj.errors import DnnmsoError, MissingExtraError, RunInterrupted, ScenarioError
+from dnnmso_mj.extras import require
 
 if TYPE_CHECKING:
     from dnnmso_mj.run import LoggedRun
@@ -44,7 +46,7 @@ UNITS = {
 
 
 def run(
-    scenario: Annotated[str, typer.Argument(help="A scenario file, or the name of a shipped one.")],
+    scenario: ScenarioName,
     overrides: Overrides = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the initial weights.")] = None,
     out: Annotated[Path | None, typer.Option(help="The log; default logs/NAME.mcap.")] = None,
@@ -57,9 +59,9 @@ def run(
 ) -> None:
     """Run a scenario headless: log, figures, summary."""
     from dnnmso_mj.loading import load_scenario, located
-    from dnnmso_mj.run import run_logged
-    from dnnmso_mj.timing import timing
+    from dnnmso_mj.run import LoggedRun, run_logged
 
+    plot = plot and _can_draw()
     sets = [*(overrides or []), *([] if seed is None else [f"seed={seed}"])]
     loaded = load_scenario(scenario, sets)
     try:
@@ -68,31 +70,27 @@ def run(
     except ScenarioError as error:
         raise located(error, scenario, sets) from error
     except RunInterrupted as stop:
+        if stop.trace is not None and (stop.ticks or as_json):
+            _tell(LoggedRun(stop.trace, stop.log), [], as_json=as_json, real_time=real_time)
         ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
         raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
     figures, undrawn = _draw(done) if plot else ([], None)
-    info = done.trace.info
-    if as_json:
-        print(json.dumps({
-            "status": info.status,
-            "reason": info.reason,
-            "scenario": loaded.name,
-            "log": str(done.log),
-            "figures": [str(figure) for figure in figures],
-            "seed": info.seed,
-            "wall_s": info.wall_s,
-            "metrics": dict(info.metrics),
-            **({"real_time": asdict(timing(done.trace))} if real_time else {}),
-        }))  # fmt: skip
-    else:
-        _print_summary(done.trace, done.log, figures)
-        if real_time:
-            _print_timing(timing(done.trace))
+    _tell(done, figures, as_json=as_json, real_time=real_time)
     if undrawn is not None:
         raise undrawn
-    if info.status == "diverged":
-        print(f"diverged: {info.reason}", file=sys.stderr)
+    if done.trace.info.status == "diverged":
+        print(f"diverged: {done.trace.info.reason}", file=sys.stderr)
         raise typer.Exit(DIVERGED)
+
+
+def _can_draw() -> bool:
+    """Whether figures can be drawn; says so if not, since a run is worth having without them."""
+    try:
+        require("plot", "figures: drawing them")
+    except MissingExtraError as error:
+        print(f"no {error} (--no-plot: without this line)", file=sys.stderr)
+        return False
+    return True
 
 
 def _draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
@@ -106,6 +104,29 @@ def _draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
             return save_figures(done.trace, done.log.parent, done.log.stem), None
     except DnnmsoError as error:
         return [], error
+
+
+def _tell(done: LoggedRun, figures: list[Path], *, as_json: bool, real_time: bool) -> None:
+    """A run's summary, as a table or as one JSON object."""
+    from dnnmso_mj.timing import timing
+
+    info = done.trace.info
+    if as_json:
+        print(json.dumps({
+            "status": info.status,
+            "reason": info.reason,
+            "scenario": done.trace.scenario.name,
+            "log": str(done.log),
+            "figures": [str(figure) for figure in figures],
+            "seed": info.seed,
+            "wall_s": info.wall_s,
+            "metrics": dict(info.metrics),
+            **({"real_time": asdict(timing(done.trace))} if real_time else {}),
+        }))  # fmt: skip
+    else:
+        _print_summary(done.trace, done.log, figures)
+        if real_time:
+            _print_timing(timing(done.trace))
 
 
 def _print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:

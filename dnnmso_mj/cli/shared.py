@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dnnmso_mj.cli.completing import complete_log, complete_scenario, complete_set
+from dnnmso_mj.paths import find_log
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -20,14 +23,41 @@ DIVERGED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
 
-Log = Annotated[Path, typer.Argument(help="A log that `dnnmso run` wrote (.mcap).")]
-ScenarioName = Annotated[str, typer.Argument(help="A scenario file, or the name of a shipped one.")]
+Log = Annotated[
+    Path,
+    typer.Argument(
+        metavar="LOG",
+        parser=find_log,
+        autocompletion=complete_log,
+        help="A log (.mcap), the name of one in logs, or last.",
+    ),
+]
+Logs = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOG...",
+        parser=find_log,
+        autocompletion=complete_log,
+        help="Logs (.mcap), names of some in logs, or last.",
+    ),
+]
+ScenarioName = Annotated[
+    str,
+    typer.Argument(
+        autocompletion=complete_scenario, help="A scenario file, or the name of a shipped one."
+    ),
+]
 Jobs = Annotated[int | None, typer.Option(min=1, help="Runs at once; default all cores.")]
 Resume = Annotated[bool, typer.Option(help="Go on from what is there.")]
 Force = Annotated[bool, typer.Option(help="Start anew whatever is there.")]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change a key, e.g. plant.gravity=1.62."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        autocompletion=complete_set,
+        help="Change a key, e.g. plant.gravity=1.62.",
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
 
