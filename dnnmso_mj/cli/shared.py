@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 DIVERGED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
+UNLIMITED = 10_000  # columns
+LABELS = {"error": "bold red", "warning": "bold yellow"}
 
 Log = Annotated[
     Path,
@@ -86,11 +90,32 @@ def progress_bar(name: str, total: int) -> Iterator[Progress]:
         yield lambda done: bar.advance(task, done)
 
 
-def print_table(table: Table, soft_wrap: bool = False) -> None:
-    """Print a table on standard output, square brackets as they are."""
+def print_table(table: Table, soft_wrap: bool = False, *, wide: bool = False) -> None:
+    """Print a table on standard output, square brackets as they are.
+
+    Args:
+        table: what is printed.
+        soft_wrap: whether a terminal breaks lines that are too long.
+        wide: whether lines may be of any length where there is no terminal.
+    """
     from rich.console import Console
 
-    Console(markup=False, soft_wrap=soft_wrap).print(table)
+    console = Console(markup=False, soft_wrap=soft_wrap)
+    if wide and not sys.stdout.isatty():
+        console.width = UNLIMITED
+    console.print(table)
+
+
+def say(label: str, text: str) -> None:
+    """Print "label: text" on standard error, the label in colour on a terminal."""
+    if not (sys.stderr.isatty() or "FORCE_COLOR" in os.environ):
+        print(f"{label}: {text}", file=sys.stderr)
+        return
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console.print(Text.assemble((label, LABELS[label]), f": {text}"))
 
 
 def near(path: Path) -> Path:
