@@ -71,6 +71,7 @@ def run_logged(
                     recorder.event(Event(0.0, "info", f"real time, {priority}"))
                 info = simulation.run(recorder, progress)
         except KeyboardInterrupt as stop:
+            end()
             wall = time.perf_counter() - started
             info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
             trace = _finish(simulation, recorder, info)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -70,6 +71,7 @@ def run(
     except ScenarioError as error:
         raise located(error, scenario, sets) from error
     except RunInterrupted as stop:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # all that is left is to say what was run
         if stop.trace is not None and (stop.ticks or as_json):
             _tell(LoggedRun(stop.trace, stop.log), [], as_json=as_json, real_time=real_time)
         ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
@@ -141,7 +143,8 @@ def _print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
         table.add_row(name, number(value), UNITS.get(name, ""))
     print_table(table, soft_wrap=True)
     simulated = len(trace) * trace.scenario.dt
-    print(f"{simulated:g} s simulated in {info.wall_s:.2f} s")
+    whole = f" of {trace.scenario.duration:g} s" if info.status == "interrupted" else ""
+    print(f"{simulated:g} s{whole} simulated in {info.wall_s:.2f} s")
     print(f"log      {near(log)}")
     for figure in figures:
         print(f"figure   {near(figure)}")
