@@ -22,7 +22,18 @@ from dnnmso_mj.loading import controller_kinds, scenario_schema
 from dnnmso_mj.paths import scenario_names, shipped_controllers
 
 BIN = Path(sys.executable).parent
-HEAVY = {"numpy", "scipy", "numba", "mujoco", "ruamel", "rich", "matplotlib", "pyarrow", "torch", "rerun"}
+HEAVY = {
+    "numpy",
+    "scipy",
+    "numba",
+    "mujoco",
+    "ruamel",
+    "rich",
+    "matplotlib",
+    "pyarrow",
+    "torch",
+    "rerun",
+}
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The core alone, in an environment of its own: what runs there, and what says which extra it lacks."""
+"""The core alone, in an environment of its own: what runs there, and what names its extra."""
 
 from __future__ import annotations
 
@@ -28,7 +28,18 @@ NEEDS = {
     "compare": (("compare", "paper", "--controllers", "pd,pid", "--seeds", "0"), "sweep"),
     "margins": (("margins", "paper", "--controllers", "pd", "--seeds", "0"), "sweep"),
     "tune": (
-        ("tune", "tuning", "--controller", "pd", "--trials", "2", "--seeds", "0", "--out", "o.yaml"),
+        (
+            "tune",
+            "tuning",
+            "--controller",
+            "pd",
+            "--trials",
+            "2",
+            "--seeds",
+            "0",
+            "--out",
+            "o.yaml",
+        ),
         "tune",
     ),
     "report": (("report", "a.parquet"), "report"),

@@ -143,5 +143,5 @@ def test_it_starts_without_importing_what_it_looks_at():
         "import dnnmso_mj.doctor.self_check\n"
         "print(sorted({'numpy', 'numba', 'mujoco', 'rich', 'ruamel'} & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.stdout.strip() == "[]", done.stderr
+    shown = subprocess.check_output([sys.executable, "-c", program], text=True)
+    assert shown.strip() == "[]"

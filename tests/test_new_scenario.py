@@ -1,4 +1,4 @@
-"""`dnnmso new`, `controllers` and `scenarios`: what is written is what it was made from, explained."""
+"""`dnnmso new`, `controllers` and `scenarios`: what is written is what it was made from."""
 
 from __future__ import annotations
 

@@ -86,9 +86,9 @@ def _run() -> int:
         if _interrupted(error):
             print("interrupted", file=sys.stderr)
             return INTERRUPTED
-        extra = isinstance(error, ImportError) and extra_of(error.name or "")
-        if extra:
-            say("error", f"{error.name} is not installed: {pip_install(extra)}")
+        name = (error.name or "") if isinstance(error, ImportError) else ""
+        if extra := extra_of(name):
+            say("error", f"{name} is not installed: {pip_install(extra)}")
         elif "cannot cache function" in str(error):
             say("error", NO_CACHE)
         else:

@@ -58,7 +58,7 @@ def complete_kind(incomplete: str) -> list[str]:
 
 def complete_set(ctx: typer.Context, incomplete: str) -> list[str]:
     """The next part of a key path that the scenario on the line may have, or a key's values."""
-    path, equals, value = incomplete.partition("=")
+    path, equals, _ = incomplete.partition("=")
     *above, last = path.split(".")
     schema = _schema()
     chosen = _chosen_kinds(ctx.params.get("scenario"), ctx.params.get("overrides") or ())

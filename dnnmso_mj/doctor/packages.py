@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from typing import TYPE_CHECKING
 
-from dnnmso_mj.doctor import Finding
+from dnnmso_mj.doctor import Finding, State
 from dnnmso_mj.extras import EXTRAS, pip_install
 
 if TYPE_CHECKING:
@@ -81,22 +81,21 @@ def _python() -> Finding:
     return Finding("packages", "Python", "broken", f"{here}; allowed: {wanted}", fix)
 
 
-def _package(requirement: Requirement, wrong: str) -> Finding:
+def _package(requirement: Requirement, wrong: State) -> Finding:
     """A package's version against its range, and what it needs itself against theirs."""
-    state = "broken" if wrong == "broken" else "note"
     fix = f"pip install '{requirement.name}{requirement.specifier}'"
     try:
         here = version(requirement.name)
     except PackageNotFoundError:
-        return Finding("packages", requirement.name, state, "not installed", fix)
+        return Finding("packages", requirement.name, wrong, "not installed", fix)
     if not requirement.specifier.contains(here, prereleases=True):
         detail = f"{here}; allowed: {requirement.specifier}"
-        return Finding("packages", requirement.name, state, detail, fix)
+        return Finding("packages", requirement.name, wrong, detail, fix)
     unmet = list(_unmet(requirement.name))
     if unmet:
         detail = f"{here}, which needs {', '.join(text for text, _ in unmet)}"
         fix = f"pip install {' '.join(repr(want) for _, want in unmet)}"
-        return Finding("packages", requirement.name, state, detail, fix)
+        return Finding("packages", requirement.name, wrong, detail, fix)
     return Finding("packages", requirement.name, "ok", here)
 
 

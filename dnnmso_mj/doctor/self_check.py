@@ -27,8 +27,7 @@ def self_check() -> Iterator[Finding]:
         done = subprocess.run(
             [sys.executable, "-P", "-m", "dnnmso_mj.doctor.self_check"],
             env=os.environ | {"PYTHONPATH": python_path()},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            capture_output=True,
             text=True,
             timeout=TIMEOUT,
             check=False,
