@@ -24,7 +24,7 @@ run: $(VENV)/.installed-run
 	$(BIN)/dnnmso run $(SCENARIO)
 
 test: $(VENV)/.installed-test
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses logical --dist loadfile $(PYTEST_ARGS)
 
 check: $(VENV)/.installed-check
 	$(BIN)/ruff format --check .

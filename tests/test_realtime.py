@@ -24,6 +24,8 @@ from dnnmso_mj.simulate import Simulation, simulate
 from dnnmso_mj.timing import timing
 from dnnmso_mj.trace import Trace
 
+pytestmark = pytest.mark.alone
+
 CLOCKED = {"compute_us", "wake_late_us", "deadline_missed"}
 
 
