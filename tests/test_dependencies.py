@@ -99,7 +99,7 @@ def test_pins_are_true():
     for items in DIRECT.values():
         for name, item in items.items():
             assert name == OWN or item.specifier.contains(pinned[name]), name
-    texts = [str(item) for items in DIRECT.values() for item in items.values() if item.name != OWN]
+    texts = [str(item) for items in DIRECT.values() for name, item in items.items() if name != OWN]
     torch_brings = set(closure(["torch"])) - set(pinned)
     missing = set(closure(texts)) - set(pinned)
     assert missing <= torch_brings  # its plain package brings CUDA along, other builds do not
