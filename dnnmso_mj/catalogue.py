@@ -36,6 +36,8 @@ _KINDS = {
     "sliding_mode": ("Slotine, Li 1991", _INPUT),
     "rise": ("Xian et al. 2004", _NOTHING),
     "l1": ("Hovakimyan, Cao 2010", _INPUT),
+    "external": ("your own: docs/extending.md", "what its code asks for"),
+    "policy": ("your own: docs/environments.md", "what it was trained with"),
 }
 
 

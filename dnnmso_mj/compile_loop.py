@@ -66,7 +66,7 @@ def is_compiled(run: Any, arguments: tuple[Any, ...]) -> bool:
 def main() -> None:
     """Compile the loop that standard input describes."""
     from dnnmso_mj.controllers import compiled_ticks
-    from dnnmso_mj.simulate import Simulation
+    from dnnmso_mj.simulation import Simulation
 
     scenario, text, folder = json.loads(sys.stdin.buffer.read())
     simulation = Simulation(Scenario.model_validate_json(scenario), Mjcf(text, folder))

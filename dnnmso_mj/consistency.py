@@ -131,7 +131,7 @@ def _vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:
 def _numbers(path: str, part: BaseModel, n: int) -> Iterator[tuple[str, int, set[int]]]:
     """Every list of a part: one number for all joints, or one for each."""
     for name, values in part:
-        if isinstance(values, tuple):
+        if isinstance(values, tuple) and values and isinstance(values[0], int | float):
             yield f"{path}.{name}", len(values), {1, n}
 
 

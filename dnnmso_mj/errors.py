@@ -25,6 +25,10 @@ class MissingExtraError(DnnmsoError):
     """An optional part of the package that is not installed."""
 
 
+class ExternalError(DnnmsoError):
+    """Code from outside this package that fails, or gives what it may not."""
+
+
 class RunInterrupted(KeyboardInterrupt):
     """Ctrl-C during a logged run; the log is whole and holds the run's first `ticks`: `trace`."""
 

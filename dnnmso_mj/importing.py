@@ -45,13 +45,18 @@ def import_named(name: str, key: str, group: str) -> Any:
     where, _, attribute = name.rpartition(":")
     try:
         found: Any = _file(Path(where)) if where.endswith(".py") else importlib.import_module(where)
-        for part in attribute.split("."):
-            found = getattr(found, part)
     except Exception as error:  # whatever foreign code raises
         raise ScenarioError(
             f"{key} = {show(name)} cannot be imported: {type(error).__name__}: {error}; allowed: "
             "module:Name of a module that Python finds, or file.py:Name"
         ) from error
+    for part in attribute.split("."):
+        names = [word for word in dir(found) if not word.startswith("_")]
+        if not hasattr(found, part):
+            has = f"it has {', '.join(names[:20])}" if names else "it has none"
+            hint = did_you_mean(part, names)
+            raise ScenarioError(f"{key} = {show(name)}: no name {show(part)} there; {has}{hint}")
+        found = getattr(found, part)
     return found
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from dnnmso_mj.scenario import Scenario
@@ -21,6 +23,7 @@ class MemoryRecorder:
     """
 
     block = LARGEST_BLOCK
+    keeps_snapshots = False
 
     def __init__(self, layout: StepLayout, n_ticks: int) -> None:
         self._layout = layout
@@ -35,7 +38,7 @@ class MemoryRecorder:
     def event(self, event: Event) -> None:
         self._events.append(event)
 
-    def snapshot(self, name: str, t: float, arrays: dict[str, Array]) -> None:
+    def snapshot(self, name: str, t: float, arrays: Mapping[str, Array]) -> None:
         """Snapshots are for logs; memory keeps none."""
 
     def trace(self, scenario: Scenario, info: RunInfo) -> Trace:

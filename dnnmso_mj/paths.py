@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 
 from dnnmso_mj.errors import DnnmsoError, LogError, ScenarioError
@@ -12,6 +14,7 @@ LITERATURE = "literature"
 LOGS = "logs"
 LAST = "last"  # the log that was written last
 LISTED = 8
+MODELS = "dnnmso_mj.models"  # entry points
 
 
 def models_dir() -> Path:
@@ -103,14 +106,15 @@ def find_model(name: str, base: Path | None = None) -> Path:
     """Find an MJCF by the name of a shipped model, or by path relative to `base`.
 
     Args:
-        name: as in `plant.model`: "two_link", "arms/mine.xml", "/home/me/mine.xml".
+        name: as in `plant.model`: "two_link", "arms/mine.xml", "/home/me/mine.xml", or what
+            `packaged_model` finds.
         base: the scenario's folder; the current directory when left out.
 
     Returns:
         Absolute path of the file.
 
     Raises:
-        ScenarioError: neither a file nor a shipped model; lists what ships.
+        ScenarioError: neither a file nor a shipped or packaged model; lists what there is.
     """
     names = _names(models_dir(), ".xml")
     path = (base or Path.cwd()) / name
@@ -119,9 +123,35 @@ def find_model(name: str, base: Path | None = None) -> Path:
         return path.resolve()
     if name.removesuffix(".xml") in names:
         return models_dir() / f"{name.removesuffix('.xml')}.xml"
-    allowed = f"allowed: an MJCF file, or one of the shipped models: {', '.join(names)}"
+    packaged = packaged_model(name)
+    if packaged is not None:
+        return packaged
+    names += [point.name for point in entry_points(group=MODELS)]
+    ships = f"or one of these models: {', '.join(names)}"
+    allowed = f"allowed: an MJCF file, {ships}; or package:file.xml of an installed package"
     hint = did_you_mean(Path(name).stem, names)
     raise ScenarioError(f"no model {show(name)} in {clean(str(path.parent))}; {allowed}{hint}")
+
+
+def packaged_model(name: str) -> Path | None:
+    """Find an MJCF that an installed package brings; None: there is none of that name.
+
+    Args:
+        name: "package:file.xml", of a file in the package's folder ("package.folder:file.xml" in
+            one below it), or the name of an entry point of the group `MODELS` with such a value.
+            Nothing is imported: a robot is data.
+    """
+    if ":" not in name:
+        points = list(entry_points(group=MODELS, name=name))
+        return packaged_model(points[0].value) if points and ":" in points[0].value else None
+    package, _, file = name.partition(":")
+    top, *below = package.strip().split(".")
+    if not all(part.isidentifier() for part in (top, *below)):
+        return None
+    spec = find_spec(top)
+    folders = (spec.submodule_search_locations if spec else None) or ()
+    paths = (Path(folder, *below, file.strip()) for folder in folders)
+    return next((path.resolve() for path in paths if _is_file(path)), None)
 
 
 def find_controller(name: str, base: Path) -> Path:
@@ -141,9 +171,19 @@ def find_controller(name: str, base: Path) -> Path:
     raise ScenarioError(f"no such file in {clean(str(base))}; {allowed}{hint}")
 
 
-def model_name(path: Path) -> str:
-    """What `find_model` finds `path` by from anywhere: a shipped model's name, else the path."""
-    return path.stem if path.parent == models_dir() else str(path)
+def model_name(path: Path, name: str = "") -> str:
+    """What `find_model` finds `path` by from anywhere: the name of a shipped or packaged model.
+
+    Args:
+        path: what `find_model` gave.
+        name: for what.
+
+    Returns:
+        The path, for any other model.
+    """
+    if path.parent == models_dir():
+        return path.stem
+    return name if name and packaged_model(name) == path else str(path)
 
 
 def _shipped(kind: str) -> Path:

@@ -45,6 +45,7 @@ INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
+WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
 RK4, EULER = int(INTEGRATORS["rk4"]), int(INTEGRATORS["euler"])
 
 TIP = "tip"  # the site at the far end of the last link
@@ -242,6 +243,20 @@ class Plant:
         mujoco.mj_resetData(self.model, self._data)
         self._data.qpos[:] = q
         self._data.qvel[:] = qd
+
+    def state(self) -> Array:
+        """Everything that the next step depends on; time, q and q̇ come first."""
+        state = np.empty(mujoco.mj_stateSize(self.model, WHOLE))
+        mujoco.mj_getState(self.model, self._data, state, WHOLE)
+        return state
+
+    def restore(self, state: Array) -> None:
+        """Go on from a `state`; of that of a plant with other parts, only q and q̇ are taken."""
+        if state.size == mujoco.mj_stateSize(self.model, WHOLE):
+            mujoco.mj_setState(self.model, self._data, state, WHOLE)
+        else:
+            n = self.q.size
+            self.reset(state[1 : 1 + n], state[1 + n : 1 + 2 * n])
 
     def damp(self, viscous: Array) -> None:
         """Give the joints viscous friction (n,) N·m·s/rad; every integrator takes it in."""

@@ -17,6 +17,7 @@ from PIL import Image
 
 from dnnmso_mj.errors import DnnmsoError
 from dnnmso_mj.figures.drawing import house_style
+from dnnmso_mj.figures.overview import overview_figure
 from dnnmso_mj.figures.theory import learning_figure, theory_figure
 from dnnmso_mj.figures.tracking import error_figure, torque_figure, tracking_figure
 from dnnmso_mj.files import write_whole
@@ -44,6 +45,16 @@ def run_figures(trace: Trace) -> dict[str, Figure]:
             figures["learning"] = learning_figure(trace, title)
         figures["theory"] = theory_figure(trace, title)
     return figures
+
+
+def overview(trace: Trace) -> Figure:
+    """Angles, errors and torques of one run in one figure, which a notebook shows by itself.
+
+    Raises:
+        DnnmsoError: the run has no tick.
+    """
+    _require_ticks({trace.scenario.name: trace})
+    return overview_figure(trace, _title(trace))
 
 
 def comparison_figures(traces: Sequence[Trace], labels: Sequence[str]) -> dict[str, Figure]:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Self
 
 import numpy as np
@@ -45,6 +45,8 @@ class McapRecorder:
         scene: the robot as a picture.
         mjcf: the model's MJCF text, kept as the attachment "model.xml".
         force: whether an existing log is removed first.
+        records: metadata that this log has besides, by name.
+        files: attachments that it has besides, by name.
 
     Raises:
         LogError: the file exists or cannot be written; nothing is left behind. A write that fails
@@ -60,6 +62,8 @@ class McapRecorder:
         mjcf: str,
         *,
         force: bool = False,
+        records: Mapping[str, dict[str, str]] = MappingProxyType({}),
+        files: Mapping[str, bytes] = MappingProxyType({}),
     ) -> None:
         self.path = Path(path)
         self._scenario = scenario
@@ -68,7 +72,7 @@ class McapRecorder:
         self._file = create(self.path, force)
         try:
             self._content = LogContent(LogWriter(self._file), layout, scenario, scene)
-            self._content.start(mjcf)
+            self._content.start(mjcf, records, files)
         except BaseException as error:
             with suppress(OSError):
                 self._file.close()

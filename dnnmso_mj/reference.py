@@ -6,7 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dnnmso_mj.scenario import ExpSinusoid, Setpoint, Sinusoid, Waypoints, expand
+from dnnmso_mj.scenario import (
+    ExpSinusoid,
+    ExternalReference,
+    Setpoint,
+    Sinusoid,
+    Waypoints,
+    expand,
+)
 from dnnmso_mj.scenario import Reference as ReferenceSpec
 
 Array = np.ndarray
@@ -19,9 +26,13 @@ class Reference:
     Args:
         spec: what the scenario asks for.
         n_joints: n.
+        span: until when (s) one from outside is checked at once.
+
+    Raises:
+        ScenarioError, ExternalError: one from outside cannot be had, or is no reference.
     """
 
-    def __init__(self, spec: ReferenceSpec, n_joints: int) -> None:
+    def __init__(self, spec: ReferenceSpec, n_joints: int, span: float = 10.0) -> None:
         self._sample: Callable[[Array], Samples]
         match spec:
             case Sinusoid():
@@ -32,6 +43,10 @@ class Reference:
                 self._sample = _setpoint(spec)
             case Waypoints():
                 self._sample = _waypoints(spec)
+            case ExternalReference():
+                from dnnmso_mj.external.reference import external_reference
+
+                self._sample = external_reference(spec, n_joints, span)
 
     def sample(self, t: Array) -> Samples:
         """q_ref, q̇_ref, q̈_ref, each (N, n), at times t (N,) in s."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from dnnmso_mj.assets import read_assets
 from dnnmso_mj.errors import LogError, RunInterrupted
 from dnnmso_mj.interrupts import interrupted_once
 from dnnmso_mj.metrics import compute_metrics
@@ -20,8 +22,8 @@ from dnnmso_mj.realtime import left_in_peace, real_time_pace
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulate import AS_FAST_AS_CAN_BE, Progress, Simulation
-from dnnmso_mj.trace import Event, RunInfo, Trace
+from dnnmso_mj.simulation import AS_FAST_AS_CAN_BE, Progress, Simulation
+from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
 
 MAX_NUMBERED = 10_000
 
@@ -63,31 +65,54 @@ def run_logged(
     mjcf = Mjcf.read(find_model(scenario.plant.model))
     pace = real_time_pace(scenario) if real_time else AS_FAST_AS_CAN_BE
     simulation = Simulation(scenario, mjcf, pace=pace)
-    with interrupted_once() as end, _open_log(simulation, mjcf, out, force) as recorder:
-        started = time.perf_counter()
-        try:
+    with _open_log(simulation, mjcf, out, force) as recorder:
+
+        def run() -> RunInfo:
             with left_in_peace() if real_time else nullcontext() as priority:
                 if priority:
                     recorder.event(Event(0.0, "info", f"real time, {priority}"))
-                info = simulation.run(recorder, progress)
+                return simulation.run(recorder, progress)
+
+        return run_to_end(run, recorder, scenario, simulation.layout)
+
+
+def run_to_end(
+    run: Callable[[], RunInfo], recorder: McapRecorder, scenario: Scenario, layout: StepLayout
+) -> LoggedRun:
+    """Run, and end the log with the metrics of what was run.
+
+    Args:
+        run: fills the log.
+        recorder: of the log.
+        scenario: that is run.
+        layout: of the log's rows.
+
+    Raises:
+        RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run. Another Ctrl-C
+            while the log is being ended does nothing.
+    """
+    with interrupted_once() as end:
+        started = time.perf_counter()
+        try:
+            info = run()
         except KeyboardInterrupt as stop:
             end()
             wall = time.perf_counter() - started
             info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
-            trace = _finish(simulation, recorder, info)
+            trace = _finish(recorder, scenario, layout, info)
             raise RunInterrupted(recorder.path, len(trace), trace) from stop
         end()
-        return LoggedRun(_finish(simulation, recorder, info), recorder.path)
+        return LoggedRun(_finish(recorder, scenario, layout, info), recorder.path)
 
 
-def _finish(simulation: Simulation, recorder: McapRecorder, info: RunInfo) -> Trace:
+def _finish(recorder: McapRecorder, scenario: Scenario, layout: StepLayout, info: RunInfo) -> Trace:
     """Compute the metrics of what the log holds, and end the log with them."""
     recorder.flush()
     if recorder.ticks:
         trace = read_trace(recorder.path)
     else:  # ended before its first row
-        empty = np.empty((0, simulation.layout.width))
-        trace = Trace(simulation.layout.columns(empty), simulation.scenario, info)
+        empty = np.empty((0, layout.width))
+        trace = Trace(layout.columns(empty), scenario, info)
     written: dict[str, Any] = {
         "versions": trace.info.versions,
         "git_commit": trace.info.git_commit,
@@ -100,16 +125,18 @@ def _finish(simulation: Simulation, recorder: McapRecorder, info: RunInfo) -> Tr
 
 def _open_log(simulation: Simulation, mjcf: Mjcf, out: Path | None, force: bool) -> McapRecorder:
     scene = Scene(simulation.plant.model)
-    scenario = simulation.scenario
+    scenario, files = simulation.scenario, read_assets(mjcf)
     if out is not None:
-        return McapRecorder(out, simulation.layout, scenario, scene, mjcf.text, force=force)
+        return McapRecorder(
+            out, simulation.layout, scenario, scene, mjcf.text, force=force, files=files
+        )
     for number in range(1, MAX_NUMBERED):
         suffix = f"-{number}" if number > 1 else ""
         path = logs_dir() / f"{scenario.name}{suffix}.mcap"
         if path.exists():
             continue
         try:
-            return McapRecorder(path, simulation.layout, scenario, scene, mjcf.text)
+            return McapRecorder(path, simulation.layout, scenario, scene, mjcf.text, files=files)
         except LogError:
             if not path.exists():
                 raise

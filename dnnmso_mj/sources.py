@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+import sys
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parent
@@ -29,6 +30,8 @@ def sources_digest(*marks: bytes) -> str:
 
 
 def python_path() -> str:
-    """A PYTHONPATH by which another interpreter imports this very package."""
+    """A PYTHONPATH by which another interpreter imports this very package, and all that we can."""
     before = os.environ.get("PYTHONPATH")
-    return os.pathsep.join([str(PACKAGE.parent), *([before] if before else [])])
+    ours = (entry or str(Path.cwd()) for entry in sys.path)
+    entries = [str(PACKAGE.parent), *([before] if before else []), *ours]
+    return os.pathsep.join(dict.fromkeys(entries))

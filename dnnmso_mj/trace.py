@@ -4,10 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from html import escape
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dnnmso_mj.scenario import Scenario
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+    from matplotlib.figure import Figure
+
+    from dnnmso_mj.metrics import Metrics
 
 Array = np.ndarray
 
@@ -94,6 +104,14 @@ class StepLayout:
             out[name] = column
         return out
 
+    def rows(self, columns: Mapping[str, Array]) -> Array:
+        """Columns of N ticks as rows (N, width); zeros where a column is narrower than here."""
+        rows = np.zeros((len(columns["t"]), self.width))
+        for name, where in self.slices.items():
+            column = columns[name].reshape(len(rows), -1)
+            rows[:, where.start : where.start + column.shape[1]] = column
+        return rows
+
 
 @dataclass(frozen=True)
 class Event:
@@ -117,9 +135,19 @@ class RunInfo:
     metrics: Mapping[str, float | int | bool | None] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trace:
-    """The columns of a run, e.g. ``trace["q"]`` of shape (N, n), with the scenario it came from."""
+    """The columns of a run, e.g. ``trace["q"]`` of shape (N, n), with the scenario it came from.
+
+    >>> from dnnmso_mj import load_scenario, simulate
+    >>> trace = simulate(load_scenario("paper", ["duration=0.1"], controller="pd"))
+    >>> trace["q"].shape  # ticks, joints
+    (100, 2)
+    >>> trace.table().column_names[:5]
+    ['t', 'q1', 'q2', 'qd1', 'qd2']
+    >>> round(trace.metrics["tau_peak"])
+    287
+    """
 
     columns: Mapping[str, Array]
     scenario: Scenario
@@ -127,7 +155,11 @@ class Trace:
     events: tuple[Event, ...] = ()
 
     def __getitem__(self, name: str) -> Array:
-        return self.columns[name]
+        try:
+            return self.columns[name]
+        except KeyError:
+            names = ", ".join(self.columns)
+            raise KeyError(f"{name!r}; a trace has {names}") from None
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.columns)
@@ -144,3 +176,68 @@ class Trace:
     def n_layers(self) -> int:
         """Number of weight layers of the controller's network; 0 without one."""
         return int(self.columns["weight_norm"].shape[1])
+
+    @cached_property
+    def metrics(self) -> Metrics:
+        """What the run is judged by; see `dnnmso_mj.metrics.compute_metrics`."""
+        from dnnmso_mj.metrics import compute_metrics
+
+        return compute_metrics(self)
+
+    def table(self) -> pa.Table:
+        """All columns as an Arrow table of one column a number.
+
+        A column of vectors is split: `q` of two joints into `q1` and `q2`, `x_hat` into `x_hat1` to
+        `x_hat4`. Each field's metadata has its `unit`, the table's the scenario and seed.
+
+        Raises:
+            MissingExtraError: pyarrow is not installed.
+        """
+        from dnnmso_mj.extras import require
+        from dnnmso_mj.trace_table import trace_table
+
+        require("sweep", "Trace.table")
+        return trace_table(self)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """`table` as a pandas data frame, the time `t` (s) as its index.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        from dnnmso_mj.trace_table import trace_frame
+
+        return trace_frame(self)
+
+    def plot(self) -> Figure:
+        """Angles, errors and torques in one figure, which a notebook shows by itself.
+
+        Raises:
+            DnnmsoError: the run has no tick.
+            MissingExtraError: matplotlib is not installed.
+        """
+        from dnnmso_mj.extras import require
+
+        require("plot", "Trace.plot")
+        from dnnmso_mj.plots import overview
+
+        return overview(self)
+
+    def __repr__(self) -> str:
+        span = len(self) * self.scenario.dt
+        words = [f"{len(self)} ticks, {span:g} s", *(f"{name} {v}" for name, v in self._shown())]
+        return f"<Trace of {self._title()}: {', '.join(words)}>"
+
+    def _repr_html_(self) -> str:
+        rows = [("ticks", str(len(self))), *self._shown()]
+        cells = "".join(f"<tr><th>{name}</th><td>{escape(value)}</td></tr>" for name, value in rows)
+        return f"<table><caption>{escape(self._title())}</caption>{cells}</table>"
+
+    def _title(self) -> str:
+        return f"{self.scenario.name}, seed {self.info.seed}, {self.info.status}"
+
+    def _shown(self) -> list[tuple[str, str]]:
+        """A few metrics in words."""
+        units = {"rmse": "rad", "rmse_steady": "rad", "tau_peak": "N·m"}
+        found = {name: self.metrics[name] for name in units}
+        return [(k, f"{v:.4g} {units[k]}") for k, v in found.items() if v is not None]

@@ -18,7 +18,7 @@ import numpy as np
 
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.metrics import compute_metrics
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 from dnnmso_mj.trace import Trace
 
 PAGE = Path(__file__).parent / "dnn_mso_replay.md"

@@ -17,7 +17,7 @@ from multiprocessing import get_context
 import numpy as np
 
 from dnnmso_mj.loading import load_scenario
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 from dnnmso_mj.sweep.plan import parse_seeds
 
 LAST = 10.0  # s

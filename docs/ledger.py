@@ -30,7 +30,7 @@ from dnnmso_mj.monitors import WATCH_EVERY
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import NoNetwork, Scenario
-from dnnmso_mj.simulate import Simulation
+from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.trace import Trace
 
 BASE = "paper"

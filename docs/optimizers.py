@@ -32,7 +32,7 @@ from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import Simulation
+from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.trace import Trace
 
 Array = np.ndarray

@@ -10,7 +10,7 @@ import pytest
 from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.imperfections.actuators import actuate, build_actuators, split
 from dnnmso_mj.scenario import Imperfections
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 DT = 1e-3
 FINE = 1000  # parts of a period in the brute-force solutions

@@ -29,7 +29,7 @@ from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import NonFiniteError
 from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.scenario import Scenario, Sinusoid
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 
 COARSE = {"dt": 0.005}  # s; a fifth of the ticks
 AT = 3.0  # s

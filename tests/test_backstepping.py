@@ -18,7 +18,7 @@ from dnnmso_mj.controllers.backstepping import BacksteppingController
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.memory_recorder import MemoryRecorder
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 
 Array = np.ndarray
 LAG = 0.05

@@ -25,7 +25,7 @@ from dnnmso_mj.bench.timing import ENOUGH_FOR_TAIL, Check, Contender, Table, rac
 from dnnmso_mj.bench.torch_steps import FlatTorch, PlainTorch
 from dnnmso_mj.network import Shape, initial_weights, network_shape
 from dnnmso_mj.scenario import Madam, Network
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 ROOT = Path(__file__).parents[1]
 PAPER_SHAPE = Shape((4, 64, 64, 64, 4), bias=True, activation="sigmoid")

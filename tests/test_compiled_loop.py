@@ -20,7 +20,7 @@ from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.plant import Plant
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 
 CLOCKED = {"compute_us", "deadline_missed", "wake_late_us"}
 
@@ -185,7 +185,7 @@ def test_without_compilation_one_line_says_so():
 def test_the_run_that_compiles_is_the_run_that_loads_bit_for_bit(tmp_path):
     program = (
         "import hashlib; from dnnmso_mj.loading import load_scenario\n"
-        "from dnnmso_mj.simulate import simulate\n"
+        "from dnnmso_mj.simulation import simulate\n"
         "trace = simulate(load_scenario('paper', ['duration=0.3']))\n"
         "print(hashlib.sha256(trace['tau'].tobytes()).hexdigest())\n"
     )

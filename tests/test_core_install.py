@@ -16,6 +16,8 @@ RUNS = {
     "run": ("run", "paper_no_network", "--set", "duration=0.1"),
     "info": ("info", "last"),
     "recover": ("recover", "last", "--out", "whole.mcap"),
+    "resume": ("resume", "last", "--at", "0.05", "--out", "resumed.mcap", "--no-plot"),
+    "diff": ("diff", "last", "last"),
     "check": ("check", "--states", "10"),
     "schema": ("schema",),
     "scenarios": ("scenarios",),

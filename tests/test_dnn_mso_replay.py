@@ -17,7 +17,7 @@ from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.memory import CLOCK, SIZE
 from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.scenario import DnnMsoReplay, Scenario
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 
 Array = np.ndarray
 KIND = "dnn_mso_replay"

@@ -15,7 +15,7 @@ from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf, Plant
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 
 RNG = np.random.default_rng(0)
 STATES = RNG.normal(size=(50, 2, 2))

@@ -9,17 +9,19 @@ import numpy as np
 import pytest
 
 from dnnmso_mj.controllers import MODEL_FROZEN, Inputs, build_controller, compiled_ticks
+from dnnmso_mj.difference import difference
 from dnnmso_mj.loading import controller_kinds
 from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.plots import run_figures
 from dnnmso_mj.reading import read_snapshots, read_trace
+from dnnmso_mj.resume import resume
 from dnnmso_mj.run import run_logged
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scenario.controller import inversion
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulate import Simulation
+from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.trace import Trace
 
 KINDS = pytest.mark.parametrize("kind", controller_kinds())
@@ -171,14 +173,14 @@ def test_to_begin_anew_after_restoring_keeps_what_was_learned_and_forgets_the_re
 
 
 @KINDS
-def test_a_log_says_what_was_run_and_can_be_drawn_and_replayed(kind, tmp_path: Path):
+def test_a_log_says_what_was_run_and_can_be_drawn_replayed_and_resumed(kind, tmp_path: Path):
     from dnnmso_mj.viewer.rrd import rrd_bytes  # not at collection: an optional library
 
     logged = run_logged(imperfect(kind), tmp_path / "run.mcap")
     trace = read_trace(logged.log)
     check_same(trace, compiled_run(kind))
     assert trace.scenario == imperfect(kind)
-    state = read_snapshots(logged.log)[-1].arrays
+    state = next(s for s in reversed(read_snapshots(logged.log)) if s.name == "controller").arrays
     assert set(state) == set(build_controller(imperfect(kind), arm()).state())
     assert trace.info.metrics["diverged"] is False
     assert (trace.info.metrics["bound_violations"] is None) == (
@@ -188,5 +190,7 @@ def test_a_log_says_what_was_run_and_can_be_drawn_and_replayed(kind, tmp_path: P
     assert ("learning" in figures) == bool(trace.n_layers)
     for figure in figures.values():
         figure.canvas.draw()
+    resumed = resume(logged.log, 0.237, out=tmp_path / "resumed.mcap").run.log
+    assert difference(logged.log, resumed).equal
     scene = Scene(Simulation(imperfect(kind), arm()).plant.model)
     assert rrd_bytes(trace, scene)[:3] == b"RRF"

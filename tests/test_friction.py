@@ -13,7 +13,7 @@ from dnnmso_mj.imperfections.loads import build_loads, load, start_loads
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf, Plant, integrate
 from dnnmso_mj.scenario import Friction
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 
 DT = 1e-3
 INTEGRATORS = ["rk4", "euler", "implicitfast"]

@@ -7,7 +7,7 @@ import pytest
 
 from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import compute_metrics
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 from dnnmso_mj.trace import Trace
 
 CLOCKED = {"compute_us", "deadline_missed", "wake_late_us"}

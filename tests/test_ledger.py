@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from dnnmso_mj.metrics import compute_metrics
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 DOCS = Path(__file__).parents[1] / "docs"
 SCRIPT, PAGE = DOCS / "ledger.py", DOCS / "reproduction.md"

@@ -11,7 +11,7 @@ from dnnmso_mj.loading import list_scenarios, load_scenario
 from dnnmso_mj.paths import find_model, scenarios_dir
 from dnnmso_mj.plant import Mjcf, NominalModel
 from dnnmso_mj.reference import Reference
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 FILES = sorted((scenarios_dir() / "literature").glob("*.yaml"))
 

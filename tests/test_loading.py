@@ -22,7 +22,7 @@ from dnnmso_mj.loading.advice import stretched_load
 from dnnmso_mj.loading.shape import Shape
 from dnnmso_mj.paths import models_dir, scenarios_dir
 from dnnmso_mj.scenario import Controller, DnnMso, NoNetwork, Plant, Scenario, Setpoint, Sinusoid
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 MINIMAL = "name: x\nreference:\n  kind: sinusoid\ncontroller:\n  kind: dnn_mso\n"  # lines 1 to 5
 PAPER = (scenarios_dir() / "paper.yaml").read_text()
@@ -210,7 +210,7 @@ REFUSED = {
     "unknown kind": (
         "",
         '3: reference.kind = "sinusiod": is none of the choices; allowed: one of: '
-        "exp_sinusoid, setpoint, sinusoid, waypoints; did you mean 'sinusoid'?",
+        "exp_sinusoid, external, setpoint, sinusoid, waypoints; did you mean 'sinusoid'?",
     ),
     "no kind": (
         "",

@@ -22,7 +22,7 @@ from dnnmso_mj.margins.run import run_margins
 from dnnmso_mj.margins.search import HALVINGS, PRECISION, PROBES_BELOW, find_margin
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 from dnnmso_mj.sweep.journal import journal_path
 from dnnmso_mj.sweep.plan import SweepError
 

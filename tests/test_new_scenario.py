@@ -112,9 +112,10 @@ def test_a_file_that_is_there_is_left_as_it_is(tmp_path, monkeypatch):
 
 def test_the_catalogue_says_of_every_kind_what_it_is_told():
     found = {item.kind: item for item in catalogue.kinds()}
-    assert set(found) == set(controller_kinds())
+    assert set(found) - {"external", "policy"} == set(controller_kinds())
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    for kind, item in found.items():
+    for kind in controller_kinds():
+        item = found[kind]
         controller = load_scenario("paper", controller=kind).controller
         form_only = "not its numbers" in item.told
         assert (item.told == "nothing") == (is_model_free(controller) and not form_only), kind

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dnnmso_mj.dynamics import TwoLink
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 
 @pytest.mark.parametrize("kinematics", [True, False])

@@ -15,7 +15,7 @@ import torch
 from dnnmso_mj.controllers import build_controller
 from dnnmso_mj.network import TorchNetwork
 from dnnmso_mj.scenario import Adam, Madam
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 SCRIPT = Path(__file__).parents[1] / "docs" / "optimizers.py"
 

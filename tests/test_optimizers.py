@@ -15,7 +15,7 @@ from dnnmso_mj.network import Shape
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Adam, Madam, Network, Rule, Sgd, SignSgd
-from dnnmso_mj.simulate import Simulation
+from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.torch_learner import TorchLearner
 from dnnmso_mj.trace import Trace
 

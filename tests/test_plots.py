@@ -28,7 +28,7 @@ from dnnmso_mj.figures.drawing import envelope, log_line, panels
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.plots import comparison_figures, run_figures, save_comparison, save_figures
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 from dnnmso_mj.trace import StepLayout, Trace
 
 pytestmark = pytest.mark.filterwarnings("error")

@@ -17,7 +17,7 @@ from dnnmso_mj.plant import NominalModel
 from dnnmso_mj.prediction import LONGEST, build_predictor, predict, report
 from dnnmso_mj.scenario import KnownDelay, Madam, Network
 from dnnmso_mj.scenario.inversion import Inversion
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 
 Array = np.ndarray
 ARM = TwoLink((1.0, 2.3), (1.0, 1.0))

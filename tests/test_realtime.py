@@ -20,7 +20,7 @@ from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.realtime import left_in_peace, real_time_pace
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 from dnnmso_mj.timing import timing
 from dnnmso_mj.trace import Trace
 

@@ -18,7 +18,7 @@ from dnnmso_mj.plant import Mjcf, NominalModel
 from dnnmso_mj.reference import Reference
 from dnnmso_mj.regressor import drift, momentum, momentum_loss, regressor
 from dnnmso_mj.scenario.adaptive import N_PARAMETERS
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 
 KINDS = ("slotine_li", "concurrent_learning")
 LINKS = ("point_mass", "rod")

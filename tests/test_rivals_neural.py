@@ -15,7 +15,7 @@ from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 
 ARM = TwoLink((1.0, 2.3), (1.0, 1.0))
 DT = 0.001

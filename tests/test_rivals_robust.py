@@ -12,7 +12,7 @@ from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import compute_metrics
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 from tests.test_compiled_loop import CLOCKED, Wrapped
 from tests.test_simulate import chain
 

@@ -12,7 +12,7 @@ from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.monitors import WATCH_EVERY
 from dnnmso_mj.network import INIT_SCALE, Shape, initial_weights, network_shape
 from dnnmso_mj.scenario import Inversion, Madam, Network
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 from dnnmso_mj.theory import begin_period, build_bounds, end_period, start_bounds
 
 

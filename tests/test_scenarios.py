@@ -28,7 +28,7 @@ from dnnmso_mj.scenario import (
     Sinusoid,
     Waypoints,
 )
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 FILES = sorted(scenarios_dir().glob("*.yaml"))
 NAMES = [file.stem for file in FILES]

@@ -10,7 +10,7 @@ import pytest
 
 from dnnmso_mj.imperfections.sensors import SensorBank, sense
 from dnnmso_mj.scenario import Imperfections
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 DT = 1e-3
 QUIET = {"position_noise": 1e-4, "velocity_noise": 1e-3}

@@ -33,7 +33,7 @@ from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.run import run_logged
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 from dnnmso_mj.sources import sources_digest
 from dnnmso_mj.sweep.journal import Journal, journal_path
 from dnnmso_mj.sweep.local import LocalEngine

@@ -10,7 +10,7 @@ import pytest
 
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.plant import Mjcf, NominalModel, Plant
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 ARM = """<mujoco><default><geom contype="0" conaffinity="0"/></default><worldbody>
   <geom name="floor" type="plane" size="1 1 1"/>

@@ -14,7 +14,7 @@ from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Madam, Network
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 
 DOUBLE = "controller.network.precision=float64"
 

@@ -16,7 +16,7 @@ from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.loading.overrides import parse_overrides
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 STATES = 400  # that a model is asked about inside, and as many outside
 LOOKS = 2000  # states of the reference that make the region
@@ -52,6 +52,8 @@ def plan_audit(
     at: Sequence[float],
     seeds: Sequence[int],
     sets: Sequence[str] = (),
+    *,
+    trust: bool = False,
 ) -> AuditPlan:
     """Validate an audit, and compile what its workers will load.
 
@@ -61,22 +63,24 @@ def plan_audit(
         at: freeze times (s), any order.
         seeds: ascending.
         sets: "a.b=c", for every controller.
+        trust: whether the scenario may name code by import path, as `load_scenario`.
 
     Raises:
         ScenarioError: as `load_scenario`.
         AuditError: a freeze time, a seed or a controller that cannot be accepted.
     """
     _check(controllers, sets)
-    scenarios = [load_scenario(source, sets, name) for name in controllers or (None,)]
+    names = controllers or (None,)
+    scenarios = [load_scenario(source, sets, name, trust=trust) for name in names]
     mjcf = Mjcf.read(find_model(scenarios[0].plant.model))
-    names = controllers or [scenarios[0].controller.kind]
     times = _times(at, scenarios[0].dt)
     for scenario in scenarios:
         for law in (scenario, without_model(scenario)):
             tick = {"duration": scenario.dt, "events": ()}
             simulate(law.model_copy(update=tick), mjcf, watch=False)
     subjects = tuple(
-        Subject(name, scenario, mjcf) for name, scenario in zip(names, scenarios, strict=True)
+        Subject(name or scenario.controller.kind, scenario, mjcf)
+        for name, scenario in zip(names, scenarios, strict=True)
     )
     return AuditPlan(subjects, _questions(subjects[0], times), tuple(seeds))
 

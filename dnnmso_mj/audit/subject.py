@@ -18,7 +18,7 @@ from dnnmso_mj.audit.unseen import SETTLING, Unseen
 from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import Simulation
+from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.trace import Trace
 
 Array = np.ndarray

@@ -24,7 +24,7 @@ from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulate import Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
 from dnnmso_mj.trace import FLAGS, SCALARS, RunInfo, StepLayout
 
 Array = np.ndarray

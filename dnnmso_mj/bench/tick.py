@@ -18,7 +18,7 @@ from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.run import run_logged
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 
 Array = np.ndarray
 

@@ -1,7 +1,7 @@
 """The paper's closed loop as an able user writes it: PyTorch, NumPy and MuJoCo's Python bindings.
 
-The same arm, reference, control law, network and update as `dnnmso_mj.simulate`, and nothing else:
-no log, no theory, no checks.
+The same arm, reference, control law, network and update as `dnnmso_mj.simulation`, and nothing
+else: no log, no theory, no checks.
 """
 
 from __future__ import annotations

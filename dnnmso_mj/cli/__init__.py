@@ -16,7 +16,6 @@ from typing import Annotated, NoReturn
 import typer
 from typer.completion import completion_init
 
-from dnnmso_mj import __version__
 from dnnmso_mj.cli import (
     audit,
     bench,
@@ -27,6 +26,7 @@ from dnnmso_mj.cli import (
     logs,
     margins,
     report,
+    resume,
     run,
     scenarios,
     sweep,
@@ -143,6 +143,8 @@ class _Warnings:
 
 def _print_version(wanted: bool) -> None:
     if wanted:
+        from dnnmso_mj import __version__
+
         print(__version__)
         raise typer.Exit
 
@@ -169,6 +171,8 @@ app.command()(logs.plot)
 app.command()(logs.replay)
 app.command()(logs.info)
 app.command()(logs.recover)
+app.command()(resume.resume)
+app.command()(resume.diff)
 app.command()(scenarios.schema)
 app.command()(scenarios.scenarios)
 app.command()(scenarios.controllers)

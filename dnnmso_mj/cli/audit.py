@@ -14,6 +14,7 @@ from dnnmso_mj.cli.shared import (
     Json,
     Overrides,
     ScenarioName,
+    Trust,
     near,
     print_table,
     progress_bar,
@@ -48,6 +49,7 @@ def audit(
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Runs at once; default all cores.")
     ] = None,
+    trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Freeze the weights, drive on, drive elsewhere: how much of the plant does the model know?"""
@@ -62,7 +64,8 @@ def audit(
 
     names = [name.strip() for name in controllers.split(",")] if controllers else []
     with working("checking every controller"):
-        plan = plan_audit(scenario, names, _numbers(at), parse_seeds(seeds), overrides or ())
+        times, numbers = _numbers(at), parse_seeds(seeds)
+        plan = plan_audit(scenario, names, times, numbers, overrides or (), trust=trust)
     with progress_bar(f"audit of {plan.name}", len(plan.subjects) * len(plan.seeds)) as progress:
         found = run_audit(plan, jobs, progress)
     folder = out or logs_dir()

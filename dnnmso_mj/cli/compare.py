@@ -18,6 +18,7 @@ from dnnmso_mj.cli.shared import (
     Overrides,
     Resume,
     ScenarioName,
+    Trust,
     near,
     number,
     plain_spread,
@@ -58,6 +59,7 @@ def compare(
     out: Annotated[Path | None, typer.Option(help="Default logs/NAME.compare.parquet.")] = None,
     resume: Resume = False,
     force: Force = False,
+    trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Hold controllers against one another, seed by seed; one row a run to Parquet."""
@@ -70,7 +72,7 @@ def compare(
 
     names, numbers = parse_controllers(controllers), parse_seeds(seeds)
     with working("checking every controller"):
-        plan = plan_comparison(scenario, names, numbers, overrides or ())
+        plan = plan_comparison(scenario, names, numbers, overrides or (), trust=trust)
     out = out or default_out(plan)
     engine, name = LocalEngine(jobs), plan.points[0].scenario.name
     result = run_watched(

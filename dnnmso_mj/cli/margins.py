@@ -17,6 +17,7 @@ from dnnmso_mj.cli.shared import (
     Overrides,
     Resume,
     ScenarioName,
+    Trust,
     near,
     plain_spread,
     print_table,
@@ -59,6 +60,7 @@ def margins(
     out: Annotated[Path | None, typer.Option(help="Default logs/NAME.margins.parquet.")] = None,
     resume: Resume = False,
     force: Force = False,
+    trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Search how much of each imperfection controllers stand."""
@@ -72,7 +74,8 @@ def margins(
     names = [name.strip() for name in controllers.split(",")]
     asked, numbers = parse_rows(rows), parse_seeds(seeds)
     with working("checking every controller and row"):
-        plan = plan_margins(scenario, names, asked, numbers, overrides or (), limit)
+        sets = overrides or ()
+        plan = plan_margins(scenario, names, asked, numbers, sets, limit, trust=trust)
     out = out or default_out(plan)
     result = run_watched(
         plan.points[0].scenario.name,

@@ -16,6 +16,7 @@ from dnnmso_mj.cli.shared import (
     Json,
     Overrides,
     ScenarioName,
+    Trust,
     near,
     number,
     print_table,
@@ -56,15 +57,16 @@ def run(
         bool, typer.Option("--real-time", help="Keep to the wall clock, one tick each dt.")
     ] = False,
     plot: Annotated[bool, typer.Option(help="Draw the figures beside the log.")] = True,
+    trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Run a scenario headless: log, figures, summary."""
     from dnnmso_mj.loading import load_scenario, located
     from dnnmso_mj.run import LoggedRun, run_logged
 
-    plot = plot and _can_draw()
+    plot = plot and can_draw()
     sets = [*(overrides or []), *([] if seed is None else [f"seed={seed}"])]
-    loaded = load_scenario(scenario, sets)
+    loaded = load_scenario(scenario, sets, trust=trust)
     try:
         with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
             done = run_logged(loaded, out, force=force, real_time=real_time, progress=progress)
@@ -73,11 +75,11 @@ def run(
     except RunInterrupted as stop:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # all that is left is to say what was run
         if stop.trace is not None and (stop.ticks or as_json):
-            _tell(LoggedRun(stop.trace, stop.log), [], as_json=as_json, real_time=real_time)
+            tell(LoggedRun(stop.trace, stop.log), [], as_json=as_json, real_time=real_time)
         ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
         raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
-    figures, undrawn = _draw(done) if plot else ([], None)
-    _tell(done, figures, as_json=as_json, real_time=real_time)
+    figures, undrawn = draw(done) if plot else ([], None)
+    tell(done, figures, as_json=as_json, real_time=real_time)
     if undrawn is not None:
         raise undrawn
     if done.trace.info.status == "diverged":
@@ -85,7 +87,7 @@ def run(
         raise typer.Exit(DIVERGED)
 
 
-def _can_draw() -> bool:
+def can_draw() -> bool:
     """Whether figures can be drawn; says so if not, since a run is worth having without them."""
     try:
         require("plot", "figures: drawing them")
@@ -95,7 +97,7 @@ def _can_draw() -> bool:
     return True
 
 
-def _draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
+def draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
     """The figures beside the log, and why there are none of those that could not be written."""
     if len(done.trace) == 0:
         return [], None
@@ -108,7 +110,7 @@ def _draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
         return [], error
 
 
-def _tell(done: LoggedRun, figures: list[Path], *, as_json: bool, real_time: bool) -> None:
+def tell(done: LoggedRun, figures: list[Path], *, as_json: bool, real_time: bool) -> None:
     """A run's summary, as a table or as one JSON object."""
     from dnnmso_mj.timing import timing
 
@@ -126,12 +128,13 @@ def _tell(done: LoggedRun, figures: list[Path], *, as_json: bool, real_time: boo
             **({"real_time": asdict(timing(done.trace))} if real_time else {}),
         }))  # fmt: skip
     else:
-        _print_summary(done.trace, done.log, figures)
+        print_summary(done.trace, done.log, figures)
         if real_time:
             _print_timing(timing(done.trace))
 
 
-def _print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
+def print_summary(trace: Trace, log: Path, figures: list[Path], since: int = 0) -> None:
+    """Metrics, speed and files of a run, of which the ticks from `since` on were simulated now."""
     from rich.table import Table
 
     info = trace.info
@@ -142,7 +145,7 @@ def _print_summary(trace: Trace, log: Path, figures: list[Path]) -> None:
     for name, value in info.metrics.items():
         table.add_row(name, number(value), UNITS.get(name, ""))
     print_table(table, soft_wrap=True)
-    simulated = len(trace) * trace.scenario.dt
+    simulated = (len(trace) - since) * trace.scenario.dt
     whole = f" of {trace.scenario.duration:g} s" if info.status == "interrupted" else ""
     print(f"{simulated:g} s{whole} simulated in {info.wall_s:.2f} s")
     print(f"log      {near(log)}")

@@ -18,7 +18,7 @@ from dnnmso_mj.paths import find_log
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dnnmso_mj.simulate import Progress
+    from dnnmso_mj.simulation import Progress
     from dnnmso_mj.sweep.statistics import Spread
 
 DIVERGED = 1
@@ -63,6 +63,9 @@ Overrides = Annotated[
         help="Change a key, e.g. plant.gravity=1.62.",
     ),
 ]
+Trust = Annotated[
+    bool, typer.Option("--trust", help="Run code that the scenario names (keys `python`).")
+]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
 
 
@@ -75,8 +78,11 @@ def working(what: str) -> AbstractContextManager[object]:
 
 
 @contextmanager
-def progress_bar(name: str, total: int) -> Iterator[Progress]:
-    """A bar on standard error, when that is a terminal; it takes the number of new steps."""
+def progress_bar(name: str, total: int | None) -> Iterator[Progress]:
+    """A bar on standard error, when that is a terminal; it takes the number of new steps.
+
+    Without a total (None) it says only that something goes on.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
     from rich.progress import TimeRemainingColumn as TimeColumn

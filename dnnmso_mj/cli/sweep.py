@@ -17,6 +17,7 @@ from dnnmso_mj.cli.shared import (
     Overrides,
     Resume,
     ScenarioName,
+    Trust,
     near,
     number,
     print_table,
@@ -53,6 +54,7 @@ def sweep(
     out: Annotated[Path | None, typer.Option(help="Default logs/NAME.parquet.")] = None,
     resume: Resume = False,
     force: Force = False,
+    trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Run many seeds and parameters; one row a run to Parquet."""
@@ -63,7 +65,8 @@ def sweep(
 
     runner = make_engine(engine, jobs, address)
     with working("checking every point"):
-        plan = plan_sweep(scenario, parse_seeds(seeds), overrides or (), grid or ())
+        numbers = parse_seeds(seeds)
+        plan = plan_sweep(scenario, numbers, overrides or (), grid or (), trust=trust)
     out = out or default_out(plan)
     result = run_watched(
         plan.points[0].scenario.name,

@@ -22,6 +22,7 @@ from dnnmso_mj.cli.shared import (
     Overrides,
     Resume,
     ScenarioName,
+    Trust,
     near,
     number,
     print_table,
@@ -64,6 +65,7 @@ def tune(
     jobs: Jobs = None,
     resume: Resume = False,
     force: Force = False,
+    trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Search for a controller's best settings; the winner is a file for `controller: {from: …}`."""
@@ -83,6 +85,7 @@ def tune(
         sets=overrides or (),
         objective=Objective(chatter_scale, max_peak, max_chatter),
         test_seeds=() if test_seeds is None else parse_seeds(test_seeds),
+        trust=trust,
         command=shlex.join(["dnnmso", *sys.argv[1:]]),
     )
     where = storage or default_storage(out)

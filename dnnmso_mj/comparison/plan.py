@@ -43,7 +43,12 @@ def parse_controllers(text: str) -> tuple[str, ...]:
 
 
 def plan_comparison(
-    source: str | Path, controllers: Sequence[str], seeds: Iterable[int], sets: Sequence[str] = ()
+    source: str | Path,
+    controllers: Sequence[str],
+    seeds: Iterable[int],
+    sets: Sequence[str] = (),
+    *,
+    trust: bool = False,
 ) -> Plan:
     """Validate a scenario with each controller in its place, down to the first tick of a run.
 
@@ -52,6 +57,7 @@ def plan_comparison(
         controllers: each the name of a shipped tuned controller, a kind (its defaults), or a file.
         seeds: the same for each; any order.
         sets: "a.b=c", for every controller.
+        trust: whether the scenario may name code by import path, as `load_scenario`.
 
     Raises:
         ScenarioError: as `load_scenario`; the place of a controller is `--controllers NAME`.
@@ -66,7 +72,7 @@ def plan_comparison(
             raise ComparisonError(f"{where}, as --controllers does; allowed: --controllers alone")
     ordered = ordered_seeds(seeds)
     models: dict[str, Mjcf] = {}
-    points = [controller_point(source, name, sets, models) for name in controllers]
+    points = [controller_point(source, name, sets, models, trust) for name in controllers]
     return Plan(str(source), ordered, tuple(points))
 
 
@@ -76,7 +82,7 @@ def default_out(plan: Plan) -> Path:
 
 
 def controller_point(
-    source: str | Path, name: str, sets: Sequence[str], models: dict[str, Mjcf]
+    source: str | Path, name: str, sets: Sequence[str], models: dict[str, Mjcf], trust: bool
 ) -> Point:
     """A scenario with a controller in its place, checked down to its first tick.
 
@@ -85,6 +91,7 @@ def controller_point(
         name: of a shipped tuned controller, a kind (its defaults), or a file.
         sets: "a.b=c", put in afterwards.
         models: those read before, by name; a new one is added.
+        trust: whether the scenario may name code by import path, as `load_scenario`.
 
     Raises:
         ScenarioError: as `load_scenario`; the place of the controller is `--controllers NAME`.
@@ -95,7 +102,7 @@ def controller_point(
     except ScenarioError as error:
         raise ScenarioError(f"{place}: {error}") from error
     try:
-        scenario = load_scenario(source, [chosen, *sets])
+        scenario = load_scenario(source, [chosen, *sets], trust=trust)
         point = ready_point(scenario, parse_overrides(sets), models)
     except ScenarioError as error:
         raise ScenarioError(str(error).replace(f"--set {clean(chosen)}:", f"{place}:")) from error

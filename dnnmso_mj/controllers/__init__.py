@@ -16,6 +16,7 @@ from dnnmso_mj.scenario import (
     ConcurrentLearning,
     DnnMso,
     DnnMsoReplay,
+    External,
     LewisNn,
     NoNetwork,
     RbfMso,
@@ -50,6 +51,31 @@ class Inputs(NamedTuple):
         """All zero, and learning."""
         x, x_ref, xd_ref = np.zeros((3, 2 * n_joints))
         return cls(x, np.zeros(n_joints), x_ref, xd_ref, np.zeros(1, np.int64))
+
+    @property
+    def q(self) -> Array:
+        """Measured angles (n,) rad."""
+        return self.x[: self.tau.size]
+
+    @property
+    def qd(self) -> Array:
+        """Measured velocities (n,) rad/s."""
+        return self.x[self.tau.size :]
+
+    @property
+    def q_ref(self) -> Array:
+        """Desired angles (n,) rad."""
+        return self.x_ref[: self.tau.size]
+
+    @property
+    def qd_ref(self) -> Array:
+        """Desired velocities (n,) rad/s."""
+        return self.x_ref[self.tau.size :]
+
+    @property
+    def qdd_ref(self) -> Array:
+        """Desired accelerations (n,) rad/s²."""
+        return self.xd_ref[self.tau.size :]
 
 
 class Command(NamedTuple):
@@ -143,6 +169,10 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
     nominal = NominalModel(scenario, mjcf)
     n, dt, seed = scenario.n_joints, scenario.dt, scenario.seed
     spec: Any = scenario.controller
+    if isinstance(spec, External):
+        from dnnmso_mj.external.controller import build_external
+
+        return build_external(scenario, spec, mjcf)
     if isinstance(spec, Rival):
         return build_rival(spec, n, dt, nominal)
     builders: dict[type, Callable[[], Controller]] = {

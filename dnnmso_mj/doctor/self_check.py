@@ -71,7 +71,7 @@ def check() -> dict[str, Any]:
     from dnnmso_mj.loading import load_scenario
     from dnnmso_mj.paths import find_model
     from dnnmso_mj.plant import Mjcf
-    from dnnmso_mj.simulate import Simulation, simulate
+    from dnnmso_mj.simulation import Simulation, simulate
 
     mjcf = Mjcf.read(find_model("two_link"))
     errors = [check_dynamics(mjcf, links, STATES).errors.values() for links in LINKS]

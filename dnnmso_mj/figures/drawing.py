@@ -70,10 +70,12 @@ def house_style() -> Iterator[None]:
         yield
 
 
-def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
+def panels(
+    count: int, columns: int, title: str, kind: type[Figure] = Figure
+) -> tuple[Figure, list[Axes]]:
     """A figure with `count` panels, filled row by row; `arrange` gives them their places."""
     rows = math.ceil(count / columns)
-    figure = Figure(figsize=(_WIDTH, 0.35 + _PANEL_HEIGHT * rows))
+    figure = kind(figsize=(_WIDTH, 0.35 + _PANEL_HEIGHT * rows))
     axes = list(figure.subplots(rows, columns, squeeze=False).ravel())
     for spare in axes[count:]:
         spare.remove()

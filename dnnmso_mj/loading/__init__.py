@@ -20,6 +20,7 @@ from dnnmso_mj.loading.overrides import Override, apply_overrides, parse_overrid
 from dnnmso_mj.loading.places import Places
 from dnnmso_mj.loading.shape import Shape, lookup, scenario_schema
 from dnnmso_mj.loading.text import read_text
+from dnnmso_mj.loading.trust import PROBLEM, anchored, import_paths, require_trust
 from dnnmso_mj.loading.tuned import CONTROLLER, Graft, graft_file, graft_sets
 from dnnmso_mj.paths import (
     find_controller,
@@ -41,6 +42,7 @@ __all__ = [
     "list_scenarios",
     "load_scenario",
     "located",
+    "require_trust",
     "scenario_schema",
 ]
 
@@ -50,7 +52,11 @@ class ScenarioWarning(UserWarning):
 
 
 def load_scenario(
-    source: str | Path, overrides: Sequence[str] = (), controller: str | None = None
+    source: str | Path,
+    overrides: Sequence[str] = (),
+    controller: str | None = None,
+    *,
+    trust: bool = False,
 ) -> Scenario:
     """Read, change and check a scenario.
 
@@ -59,10 +65,13 @@ def load_scenario(
         overrides: `--set` strings, "plant.gravity=1.62"; see `dnnmso_mj.loading.overrides`.
         controller: what replaces the scenario's own controller, before `overrides` change it: a
             shipped tuned controller, a kind with its defaults, or a file.
+        trust: whether it may name code by import path, which a run of it then runs; nothing is
+            imported here.
 
     Returns:
-        The scenario. Its plant.model is a shipped model's name or an absolute path. A relative
-        path is taken from the scenario's folder in a file, from the current folder in a `--set`.
+        The scenario. Its plant.model is a name that is found from anywhere, or an absolute path; so
+        is code of its own. A relative path is taken from the folder of the file that it stands in,
+        from the current folder in a `--set`.
         `controller: {from: NAME}` is replaced by what NAME holds; see `dnnmso_mj.loading.tuned`.
 
     Raises:
@@ -78,6 +87,8 @@ def load_scenario(
     draft = _draft(source, overrides)
     data, places, complaints = draft.data, draft.places, draft.complaints
     complaints += _resolve_model(data, draft.file, places.sets)
+    if not trust:
+        complaints += [complain(path, data, PROBLEM) for path, _ in import_paths(data)]
     scenario = None
     try:
         scenario = Scenario.model_validate(data)
@@ -124,9 +135,10 @@ def kind_set(kind: str) -> str:
 
 
 def controller_kinds() -> tuple[str, ...]:
-    """Every kind of controller."""
+    """Every kind of controller that its defaults alone make one."""
     controller = Shape.root().child("controller")
-    return controller.choices if controller else ()
+    kinds = controller.kinds if controller else {}
+    return tuple(kind for kind, shape in kinds.items() if shape.required <= {"kind"})
 
 
 def located(
@@ -172,7 +184,7 @@ def _draft(source: str | Path, overrides: Sequence[str]) -> _Draft:
         problems = problems or [_not_a_scenario(root)]
         raise ScenarioError(Places(file, root, sets).message(problems, []))
     sets, brought, complaints = graft_sets(sets)
-    data = root.plain()
+    data = anchored(root.plain(), file.absolute().parent)
     grafts: list[Graft] = []
     if not any(item.path == CONTROLLER for item in sets):
         grafts, more = graft_file(data, file.absolute().parent)
@@ -199,7 +211,7 @@ def _resolve_model(data: Any, file: Path, sets: Sequence[Override]) -> list[Comp
         return []
     base = Path.cwd() if any(item.covers(path) for item in sets) else file.absolute().parent
     try:
-        data["plant"]["model"] = model_name(find_model(name, base))
+        data["plant"]["model"] = model_name(find_model(name, base), name)
     except ScenarioError as error:
         return [complain(path, data, str(error))]
     return []

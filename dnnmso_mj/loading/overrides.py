@@ -13,12 +13,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading.complaints import Complaint, complain
 from dnnmso_mj.loading.documents import read_document
 from dnnmso_mj.loading.shape import ABSENT, Shape, lookup
+from dnnmso_mj.loading.trust import anchored
 from dnnmso_mj.wording import KeyPath, clean, dotted, show
 
 FORM = "allowed: KEY.PATH=VALUE, as in plant.gravity=1.62"
@@ -80,7 +82,8 @@ def _parse(text: str) -> Override | str:
         return f"{place}: {problems[0].text}"
     if root is None:
         return f"{place}: no value; {FORM}; null for nothing, '' for an empty text"
-    return Override(text, path, root.plain())
+    key, here = path[-1], Path.cwd()
+    return Override(text, path, anchored({key: root.plain()}, here)[key])
 
 
 def _put(data: dict[str, Any], override: Override) -> Complaint | None:

@@ -24,6 +24,7 @@ _NOUNS = {
     "string": ("text", "texts"),
     "boolean": ("true or false", "true or false"),
     "null": ("null", "null"),
+    "object": ("a group of keys", "groups of keys"),
 }
 
 
@@ -96,6 +97,11 @@ class Shape:
     def keys(self) -> tuple[str, ...]:
         """The keys of a part; empty for a value, and for a part whose kind is not chosen."""
         return tuple(self._target.get("properties", ()))
+
+    @property
+    def required(self) -> frozenset[str]:
+        """The keys of a part that have no default."""
+        return frozenset(self._target.get("required", ()))
 
     @property
     def choices(self) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ from dnnmso_mj.loading.overrides import Override
 from dnnmso_mj.loading.places import Places
 from dnnmso_mj.loading.shape import ABSENT, Shape, lookup
 from dnnmso_mj.loading.text import read_text
+from dnnmso_mj.loading.trust import anchored
 from dnnmso_mj.paths import find_controller
 from dnnmso_mj.scenario.tuned import TunedController
 from dnnmso_mj.wording import KeyPath, clean, show
@@ -56,7 +57,8 @@ class Graft:
 
     def controller(self) -> dict[str, Any]:
         """The file's controller, with what is set beside `from`."""
-        merged: dict[str, Any] = _merged(self.root.plain()["controller"], self.own)
+        base = anchored(self.root.plain()["controller"], self.file.absolute().parent)
+        merged: dict[str, Any] = _merged(base, self.own)
         return merged
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 
@@ -68,14 +69,23 @@ class LogContent:
         self._tf_stride = max(1, int(np.ceil(_TF_PERIOD_S / scenario.dt - 1e-9)))
         self._channels: dict[str, int] = {}
 
-    def start(self, mjcf: str) -> None:
-        """What every log begins with."""
+    def start(
+        self,
+        mjcf: str,
+        records: Mapping[str, dict[str, str]] = MappingProxyType({}),
+        files: Mapping[str, bytes] = MappingProxyType({}),
+    ) -> None:
+        """What every log begins with, and metadata records and files that this one has besides."""
         writer, commit = self._writer, git_commit()
         writer.add_metadata("scenario", scenario_record(self._scenario))
         writer.add_metadata("versions", software_versions())
         if commit:
             writer.add_metadata("git", {"commit": commit})
+        for name, record in records.items():
+            writer.add_metadata(name, record)
         writer.add_attachment(0, MODEL, "application/xml", mjcf.encode())
+        for name, data in files.items():
+            writer.add_attachment(0, name, "application/octet-stream", data)
         for topic in (STEP, TF, ROBOT_DESCRIPTION, SCENE, EVENTS):
             schema_id = writer.add_schema(topic.schema_name, topic.schema_encoding, topic.schema)
             self._channels[topic.name] = writer.add_channel(topic.name, topic.encoding, schema_id)

@@ -16,7 +16,7 @@ from dnnmso_mj.margins.search import PRECISION, Found, find_margin
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 from dnnmso_mj.sweep.plan import code_identity
 from dnnmso_mj.sweep.task import Row, failed_row
 from dnnmso_mj.wording import clean
@@ -95,7 +95,7 @@ class MarginPlan:
             "precision": PRECISION,
             "scenarios": scenarios,
             "models": {c.scenario.plant.model: c.mjcf.text for c in self.points},
-            **code_identity(),
+            **code_identity(self.controllers.values()),
         }
 
 
@@ -155,6 +155,8 @@ def plan_margins(
     seeds: Sequence[int],
     sets: Sequence[str] = (),
     limit: float = LIMIT,
+    *,
+    trust: bool = False,
 ) -> MarginPlan:
     """Validate every controller and row, down to the first tick of a run.
 
@@ -165,6 +167,7 @@ def plan_margins(
         seeds: of initial weights and noise; ascending.
         sets: "a.b=c", for every controller.
         limit: the largest `rmse_steady` that counts as standing (rad), the same for all.
+        trust: whether the scenario may name code by import path, as `load_scenario`.
 
     Raises:
         ScenarioError: as `load_scenario`; the place of a controller is `--controllers NAME`.
@@ -179,7 +182,7 @@ def plan_margins(
     points: list[Cell] = []
     models: dict[str, Mjcf] = {}
     for name in controllers:
-        point = controller_point(source, name, sets, models)
+        point = controller_point(source, name, sets, models, trust)
         scenario, mjcf = point.scenario, point.mjcf
         for row in rows:
             spec = ROWS[row]

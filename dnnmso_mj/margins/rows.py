@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from dnnmso_mj.errors import DnnmsoError
 from dnnmso_mj.loading.complaints import explain
-from dnnmso_mj.scenario import Inertia, Scenario
+from dnnmso_mj.scenario import External, Inertia, Scenario
 from dnnmso_mj.scenario.adaptive import ConcurrentLearning, SlotineLi
 from dnnmso_mj.wording import clean, did_you_mean
 
@@ -242,6 +242,6 @@ def nominal_model(controller: Any) -> tuple[str, ...] | None:
 
 
 def is_model_free(controller: Any) -> bool:
-    """Whether a controller's settings give it no model: neither masses nor a regressor."""
-    knows_the_form = isinstance(controller, SlotineLi | ConcurrentLearning)
-    return nominal_model(controller) is None and not knows_the_form
+    """Whether a controller's settings give it no model: neither masses, a regressor, nor code."""
+    may_know = isinstance(controller, SlotineLi | ConcurrentLearning | External)
+    return nominal_model(controller) is None and not may_know

@@ -17,6 +17,11 @@ from dnnmso_mj.scenario.backstepping import Backstepping
 from dnnmso_mj.scenario.controller import ClassicalMso, Controller, DnnMso, NoNetwork, RbfMso
 from dnnmso_mj.scenario.effectiveness import Constant, Effectiveness, Inertia
 from dnnmso_mj.scenario.events import Event, Freeze, Payload, Push
+from dnnmso_mj.scenario.external import (
+    External,
+    ExternalImperfection,
+    ExternalReference,
+)
 from dnnmso_mj.scenario.fields import (
     FiniteEach,
     NonNegative,
@@ -53,6 +58,9 @@ __all__ = [
     "Effectiveness",
     "Event",
     "ExpSinusoid",
+    "External",
+    "ExternalImperfection",
+    "ExternalReference",
     "Freeze",
     "Friction",
     "Imperfections",
@@ -94,7 +102,7 @@ class Plant(Strict):
     """The robot that MuJoCo steps."""
 
     model: str = PAPER_MODEL
-    """MJCF: the name of a shipped model, or a path relative to the scenario file."""
+    """MJCF: a shipped model's name, a path from this file, or package:file.xml of a package."""
     links: Literal["point_mass", "rod"] = "point_mass"
     """Mass of each link: a point at its tip, or a uniform thin rod."""
     masses: Positives | None = (1.0, 2.3)
@@ -199,7 +207,9 @@ class Waypoints(Strict):
         return self
 
 
-Reference = Annotated[Sinusoid | ExpSinusoid | Setpoint | Waypoints, Field(discriminator="kind")]
+Reference = Annotated[
+    Sinusoid | ExpSinusoid | Setpoint | Waypoints | ExternalReference, Field(discriminator="kind")
+]
 
 
 class Stall(Strict):

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from dnnmso_mj.scenario.adaptive import ConcurrentLearning, SlotineLi
 from dnnmso_mj.scenario.backstepping import Backstepping
 from dnnmso_mj.scenario.effectiveness import Constant, Effectiveness, Inertia
+from dnnmso_mj.scenario.external import External
 from dnnmso_mj.scenario.fields import NonNegative, Positive, PositiveEach, Strict, refusal
 from dnnmso_mj.scenario.inversion import Inversion
 from dnnmso_mj.scenario.learning import Network, Observer
@@ -131,7 +132,8 @@ Controller = Annotated[
     | Backstepping
     | SlotineLi
     | ConcurrentLearning
-    | Rival,
+    | Rival
+    | External,
     Field(discriminator="kind"),
 ]
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
+from dnnmso_mj.scenario.external import ExternalImperfection
 from dnnmso_mj.scenario.fields import (
     CountEach,
     FiniteEach,
     NonNegativeEach,
     PositiveEach,
     Strict,
+    as_tuple,
     expand,
     refusal,
 )
@@ -84,6 +86,8 @@ class Imperfections(Strict):
     """Time constant of the low-pass filter of that difference (s)."""
     friction: Friction = Friction()
     """Friction in the joints."""
+    external: Annotated[tuple[ExternalImperfection, ...], BeforeValidator(as_tuple)] = ()
+    """Imperfections of your own; see docs/extending.md."""
 
     @model_validator(mode="after")
     def _one_velocity(self) -> Imperfections:

@@ -5,20 +5,22 @@ from __future__ import annotations
 import itertools
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from dnnmso_mj.errors import DnnmsoError, ScenarioError
+from dnnmso_mj.external.identity import code_digests
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.loading.overrides import Override, parse_overrides
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.provenance import git_commit, software_versions
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 from dnnmso_mj.sources import sources_digest
 from dnnmso_mj.sweep.task import Task
 from dnnmso_mj.wording import clean
@@ -99,14 +101,15 @@ class Plan:
         return {
             "points": points,
             "models": {p.scenario.plant.model: p.mjcf.text for p in self.points},
-            **code_identity(),
+            **code_identity(point.scenario for point in self.points),
         }
 
 
-def code_identity() -> dict[str, Any]:
-    """Which code the numbers of this installation come from."""
-    versions = software_versions()
+def code_identity(scenarios: Iterable[Scenario]) -> dict[str, Any]:
+    """Which code the numbers of these scenarios come from, here."""
+    versions, outside = software_versions(), code_digests(scenarios)
     return {
+        **({"outside": outside} if outside else {}),
         "versions": {name: versions[name] for name in NUMBERS_DEPEND_ON},
         "git_commit": git_commit(),
         "source_sha256": sources_digest(),
@@ -114,7 +117,12 @@ def code_identity() -> dict[str, Any]:
 
 
 def plan_sweep(
-    source: str | Path, seeds: Iterable[int], sets: Sequence[str] = (), grid: Sequence[str] = ()
+    source: str | Path,
+    seeds: Iterable[int],
+    sets: Sequence[str] = (),
+    grid: Sequence[str] = (),
+    *,
+    trust: bool = False,
 ) -> Plan:
     """Validate every point of a sweep, down to the first tick of a run.
 
@@ -123,6 +131,7 @@ def plan_sweep(
         seeds: of the initial weights; any order.
         sets: "a.b=c", for every point.
         grid: "a.b=1,2,3"; the points are the cartesian product.
+        trust: whether the scenario may name code by import path, as `load_scenario`.
 
     Raises:
         ScenarioError: as `load_scenario`; the place of a grid's value is `--grid a.b=c`.
@@ -131,10 +140,11 @@ def plan_sweep(
     axes = [_axis(text) for text in grid]
     check_keys(parse_overrides(sets), axes)
     ordered = ordered_seeds(seeds)
+    load = partial(load_scenario, trust=trust)
     models: dict[str, Mjcf] = {}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        points = [_point(source, sets, values, models) for values in itertools.product(*axes)]
+        points = [_point(load, source, sets, values, models) for values in itertools.product(*axes)]
     texts = [item.text for axis in axes for item in axis]
     said = {_as_grid(str(item.message), texts): item.category for item in caught}
     for message, category in said.items():
@@ -262,11 +272,15 @@ def check_keys(sets: Sequence[Override], axes: Sequence[tuple[Override, ...]] = 
 
 
 def _point(
-    source: str | Path, sets: Sequence[str], values: Sequence[Override], models: dict[str, Mjcf]
+    load: Callable[..., Scenario],
+    source: str | Path,
+    sets: Sequence[str],
+    values: Sequence[Override],
+    models: dict[str, Mjcf],
 ) -> Point:
     texts = [item.text for item in values]
     with _typed_as_grid(texts):
-        scenario = load_scenario(source, [*sets, *texts])
+        scenario = load(source, [*sets, *texts])
     return ready_point(scenario, (*parse_overrides(sets), *values), models)
 
 

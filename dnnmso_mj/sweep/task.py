@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Protocol
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.simulate import simulate
+from dnnmso_mj.simulation import simulate
 from dnnmso_mj.wording import clean
 
 Row = dict[str, Any]

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dnnmso_mj import __version__
+from dnnmso_mj.external.identity import code_digests
 from dnnmso_mj.loading import controller_kinds, controller_set, kind_set, load_scenario
 from dnnmso_mj.loading.overrides import parse_overrides
 from dnnmso_mj.loading.shape import lookup
@@ -41,6 +42,7 @@ class Request:
         sets: "a.b=c", for every trial; a key that is set is not tuned.
         objective: what is minimised.
         test_seeds: of runs that no trial is judged by; the first and the best trial are.
+        trust: whether the scenario may name code by import path, as `load_scenario`.
         command: what a person would type for it; kept in the file.
     """
 
@@ -51,6 +53,7 @@ class Request:
     sets: Sequence[str] = ()
     objective: Objective = field(default_factory=Objective)
     test_seeds: Sequence[int] = ()
+    trust: bool = False
     command: str = ""
 
 
@@ -68,7 +71,7 @@ class Search:
         name = request.controller
         chosen = kind_set(name) if name in controller_kinds() else controller_set(name)
         self._sets = [chosen, *request.sets]
-        self.scenario = load_scenario(request.source, self._sets)
+        self.scenario = load_scenario(request.source, self._sets, trust=request.trust)
         models: dict[str, Mjcf] = {}
         self._point = ready_point(self.scenario, parse_overrides(request.sets), models)
         self.name = self.scenario.name
@@ -81,7 +84,8 @@ class Search:
         tried = [f"controller.{path}={self._meant(path, value)}" for path, value in values.items()]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of gains that the search tries and finds wanting
-            return load_scenario(self._request.source, [*self._sets, *tried])
+            sets = [*self._sets, *tried]
+            return load_scenario(self._request.source, sets, trust=self._request.trust)
 
     def _meant(self, path: str, value: float) -> str:
         """What a tried number stands for: itself, or the starting numbers times it."""
@@ -112,6 +116,7 @@ class Search:
             "model": self._point.mjcf.text,
             "versions": {name: versions[name] for name in NUMBERS_DEPEND_ON},
             "source_sha256": sources_digest(),
+            **({"outside": outside} if (outside := code_digests([self.scenario])) else {}),
         }
 
     def record(self, study: str, value: float) -> Tuning:

@@ -13,6 +13,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from dnnmso_mj.tuning import TuneError
+
 
 class Range(NamedTuple):
     """Where a number is sought, both ends included; by its logarithm where `log`.
@@ -120,8 +122,16 @@ def space_of(controller: Mapping[str, Any]) -> Space:
 
     Args:
         controller: as a scenario has it, every key there.
+
+    Raises:
+        TuneError: a kind that is code of its own.
     """
-    space = dict(SPACES[controller["kind"]])
+    kind = controller["kind"]
+    if kind not in SPACES:
+        raise TuneError(
+            f"controller.kind = {kind}: nothing of it is tuned; allowed: {', '.join(SPACES)}"
+        )
+    space = dict(SPACES[kind])
     for above in ("", "inversion"):
         settings = controller.get(above, {}) if above else controller
         if settings.get("effectiveness", {}).get("kind") == "constant":

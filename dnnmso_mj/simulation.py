@@ -7,7 +7,7 @@ other has its `update` called tick by tick between the same two compiled halves.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -18,27 +18,26 @@ from dnnmso_mj.compiling import CompileNotice
 from dnnmso_mj.controllers import (
     LEARNING,
     Controller,
-    Inputs,
     build_controller,
     compiled_ticks,
 )
 from dnnmso_mj.errors import NonFiniteError
-from dnnmso_mj.imperfections.actuators import build_actuators, start_actuators
-from dnnmso_mj.imperfections.loads import Loads, build_loads, start_loads
+from dnnmso_mj.external.imperfection import Hooks
+from dnnmso_mj.imperfections.actuators import start_actuators
+from dnnmso_mj.imperfections.loads import start_loads
 from dnnmso_mj.imperfections.sensors import SensorBank, sense
 from dnnmso_mj.imperfections.tip import Tip
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK, MemoryRecorder
-from dnnmso_mj.plant import RK4, Mjcf, NominalModel, Plant
+from dnnmso_mj.plant import Mjcf, NominalModel, Plant
 from dnnmso_mj.reference import Reference
-from dnnmso_mj.scenario import Constant, Scenario
-from dnnmso_mj.scenario.controller import effectiveness, inversion, lookahead
-from dnnmso_mj.theory import build_bounds, start_bounds
+from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.scenario.controller import lookahead
+from dnnmso_mj.theory import start_bounds
 from dnnmso_mj.tick import (
     CHUNK_START,
     DIVERGED_ABOVE,
     MISSED,
     MUJOCO_ZEROES_ABOVE,
-    N_COUNTS,
     OUT_OF_RANGE,
     ROWS,
     RUNNING,
@@ -48,19 +47,19 @@ from dnnmso_mj.tick import (
     TAU_TOO_LARGE,
     TOOK_NS,
     Pace,
-    World,
     begin_tick,
     end_tick,
 )
 from dnnmso_mj.timeline import plan, tip_of_interest
 from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
+from dnnmso_mj.world import CHUNK, build_world
+from dnnmso_mj.world_state import State, capture, restore
 
 Array = np.ndarray
 Progress = Callable[[int], None]
 
 HEAD_START_NS = 20_000_000  # from a paced run's beginning to its first tick
 BLOCK = 50  # ticks between two looks at the recorder, progress and interrupts
-CHUNK = 1000  # ticks of the reference sampled at once
 SNAPSHOT_PERIOD = 1.0  # s
 CHANGES = {
     "saturated": ("torque limit reached", "torque limit left"),
@@ -70,7 +69,11 @@ AS_FAST_AS_CAN_BE = Pace(0, 0, 0.0, np.zeros((0, 2), np.int64))
 
 
 class Recorder(Protocol):
-    """Where the rows of a run go; one with an attribute `block` takes that many at once."""
+    """Where the rows of a run go.
+
+    One with an attribute `block` takes that many at once; one whose `keeps_snapshots` is False is
+    given none.
+    """
 
     def append(self, rows: Array) -> None:
         """Take some ticks: rows (m, `StepLayout.width`), which are overwritten afterwards."""
@@ -78,8 +81,8 @@ class Recorder(Protocol):
     def event(self, event: Event) -> None:
         """Take an event."""
 
-    def snapshot(self, name: str, t: float, arrays: dict[str, Array]) -> None:
-        """Take the controller's whole state at time t."""
+    def snapshot(self, name: str, t: float, arrays: Mapping[str, Array]) -> None:
+        """Take the whole state of the controller, or of the world, at time t (s)."""
 
 
 class Simulation:
@@ -108,7 +111,8 @@ class Simulation:
         n, dt = scenario.n_joints, scenario.dt
         self.scenario = scenario
         self.plant = Plant(scenario, mjcf)
-        self.reference = Reference(scenario.reference, n)
+        self.reference = Reference(scenario.reference, n, scenario.duration)
+        self.hooks = Hooks(scenario, mjcf)
         self._mjcf = None if controller else mjcf  # what the controller can be made of again
         self.controller = controller or build_controller(scenario, mjcf, watch=watch)
         self.layout = StepLayout(n, self.controller.n_layers)
@@ -118,67 +122,42 @@ class Simulation:
         self._tip = Tip(self.plant.model, scenario.plant.model) if of_interest else None
         self._sensors = SensorBank(scenario.imperfections, n, dt, scenario.seed, CHUNK)
         self._lookahead = lookahead(scenario.controller)
-        self.world = self._build_world(pace, build_loads(scenario, self.plant, self._tip))
+        sensors, nominal, width = self._sensors.view, self._nominal.view, self.layout.width
+        if self.hooks:
+            sensors = sensors._replace(perfect=False)
+        self.world = build_world(scenario, self.plant, self._tip, sensors, nominal, pace, width)
         self._plan = plan(scenario, self.world.loads, self._tip, self.world.inputs.frozen)
         self._flags = dict.fromkeys(CHANGES, False)
         self._first_state: dict[str, Array] | None = None
 
-    def _build_world(self, pace: Pace, loads: Loads) -> World:
-        scenario, n, dt = self.scenario, self.scenario.n_joints, self.scenario.dt
-        believed, law = effectiveness(scenario.controller), inversion(scenario.controller)
-        first_order = self.plant.view.integrator != RK4
-        reference = np.zeros((CHUNK, 3 * n))
-        x, x_ref, xd_ref, e_track, f_true, f_err = np.zeros((6, 2 * n))
-        return World(
-            plant=self.plant.view,
-            sensors=self._sensors.view,
-            actuators=build_actuators(scenario.imperfections, n, dt),
-            loads=loads,
-            bounds=build_bounds(law, n, dt, first_order=first_order),
-            pace=pace,
-            reference=reference,
-            ahead=np.zeros_like(reference) if self._lookahead else reference,
-            x=x,
-            x_ref=x_ref,
-            xd_ref=xd_ref,
-            inputs=Inputs.zeros(n),
-            e_track=e_track,
-            f_true=f_true,
-            f_err=f_err,
-            tau=np.zeros(n),
-            qdd=np.zeros(n),
-            L=np.zeros((n, n)),
-            nominal=self._nominal.view,
-            b=believed.b if isinstance(believed, Constant) else 0.0,
-            inverts=law is not None,
-            rows=np.zeros((LARGEST_BLOCK, self.layout.width)),
-            counts=np.zeros(N_COUNTS, np.int64),
-            late_ns=np.zeros(1, np.int64),
-            timespec=np.zeros(2, np.int64),
-            dt=dt,
-        )
-
-    def run(self, recorder: Recorder, progress: Progress | None = None) -> RunInfo:
+    def run(
+        self,
+        recorder: Recorder,
+        progress: Progress | None = None,
+        *,
+        start: State | None = None,
+        until: int | None = None,
+    ) -> RunInfo:
         """Run the scenario from its start to its end, or to its divergence.
 
         Args:
             recorder: takes rows, events and snapshots.
             progress: called now and then with the number of ticks done since.
+            start: where to go on instead, of a run of this scenario; see `state`.
+            until: the tick to stop before, instead of at the scenario's end.
 
         Returns:
             Status "ok" or "diverged" (with the reason), the seed and the wall time of the loop.
         """
         status, reason = "ok", ""
-        self._tick = 0
-        self._ticks = compiled_ticks(self.controller)
-        self._prepare()
+        self.begin(start)
         started = time.perf_counter()
         try:
-            self._loop(recorder, progress)
+            self._loop(recorder, progress, self.scenario.n_ticks if until is None else until)
         except NonFiniteError as error:
             t = self._tick * self.scenario.dt
             state = self.controller.state()
-            causes = [name for name, values in state.items() if not np.isfinite(values).all()]
+            causes = [name for name, values in state.items() if not _finite(values)]
             cause = f" with {', '.join(causes)} not finite" if causes else ""
             status, reason = "diverged", f"{error}{cause} at t = {t:.6g} s"
             recorder.event(Event(t, "error", f"diverged: {reason}"))
@@ -186,12 +165,31 @@ class Simulation:
         wall = time.perf_counter() - started
         return RunInfo(status=status, seed=self.scenario.seed, wall_s=wall, reason=reason)
 
-    def _prepare(self) -> None:
-        """Load or compile what ticks need, so that none of them pays for it; go to the start."""
+    @property
+    def snapshot_every(self) -> int:
+        """Ticks between two snapshots."""
+        return max(1, round(SNAPSHOT_PERIOD / self.scenario.dt))
+
+    def begin(self, start: State | None = None) -> None:
+        """Go to the start of the scenario, or to a state that a run of it was in."""
+        self._ticks = None if self.hooks else compiled_ticks(self.controller)
+        self._prepare()
         if self._first_state is None:
             self._first_state = self.controller.state()
         else:
             self.controller.restore(self._first_state)
+        self._start()
+        if start is not None:
+            self._go_on(start)
+
+    def state(self) -> State:
+        """The state after `begin` or a run that has not diverged, copied."""
+        flags = np.array(list(self._flags.values()))
+        world = capture(self.world, self.plant, self.hooks, flags)
+        return State(self._tick, self.controller.state(), world)
+
+    def _prepare(self) -> None:
+        """Load or compile what ticks need, so that none of them pays for it."""
         with event.install_listener("numba:compile", CompileNotice()):
             if self._ticks is not None:
                 arguments = (self.world, self._ticks.parts, 0, 0)
@@ -205,7 +203,6 @@ class Simulation:
                 self._command = self.controller.update(world.inputs)
                 end_tick(world, self._command, 0)
                 self.controller.restore(state)
-        self._start()
 
     def _start(self) -> None:
         scenario, world, n = self.scenario, self.world, self.scenario.n_joints
@@ -221,29 +218,53 @@ class Simulation:
         start_bounds(world.bounds, x - np.concatenate([q_ref[0], qd_ref[0]]))
         world.tau[:] = 0.0
         world.inputs.frozen[0] = LEARNING
-        self._happened = 0
+        self._tick = self._happened = 0
         world.counts[:] = 0
         self._begin_chunk(0)
-        self.controller.reset(self._first_reading(x))
+        self.hooks.start()
+        self.controller.reset(self._reading(x))
         self._flags = dict.fromkeys(CHANGES, False)
 
-    def _first_reading(self, x: Array) -> Array:
-        """What the sensors say of the start x (2n,), and will say again at tick 0."""
-        reading = x.copy()
-        if not self._sensors.view.perfect:
-            sense(self._sensors.view, x, 0, 0, reading)
+    def _go_on(self, start: State) -> None:
+        """From the scenario's start to a later state; random numbers until then are passed over."""
+        self._tick = start.tick
+        for happening in self._plan:
+            if happening.tick < start.tick:
+                happening.act()
+                self._happened += 1
+        for first in range(CHUNK, start.tick + 1, CHUNK):
+            self._begin_chunk(first)
+        restore(self.world, self.plant, self.hooks, start.world)
+        # What pushed in the period before is still to be accounted for.
+        self.world = self.world._replace(loads=self.world.loads._replace(acting=True))
+        self._flags = dict(zip(CHANGES, start.world["flags"].tolist(), strict=True))
+        if start.controller is None:
+            self.controller.reset(self._reading(np.concatenate([self.plant.q, self.plant.qd])))
+        else:
+            self.controller.restore(start.controller)
+
+    def _reading(self, x: Array) -> Array:
+        """What the sensors say of the state x (2n,) at the present tick, and will say again."""
+        reading, sensors, k = x.copy(), self._sensors.view, self._tick
+        if not sensors.perfect:
+            last = sensors.last.copy()
+            sense(sensors, x, k, k % CHUNK, reading)
+            sensors.last[:] = last
+        if self.hooks:
+            before = self.hooks.state()
+            self.hooks.sense(k * self.scenario.dt, reading)
+            self.hooks.restore(before)
         return reading
 
-    def _loop(self, recorder: Recorder, progress: Progress | None) -> None:
-        n_ticks, dt = self.scenario.n_ticks, self.scenario.dt
-        snapshot_every = max(1, round(SNAPSHOT_PERIOD / dt))
+    def _loop(self, recorder: Recorder, progress: Progress | None, n_ticks: int) -> None:
+        snapshot_every = self.snapshot_every
         block = min(getattr(recorder, "block", BLOCK), LARGEST_BLOCK)
         self.world.counts[START_NS] = time.monotonic_ns() + HEAD_START_NS
         while self._tick < n_ticks:
             first = self._tick
             if first % snapshot_every == 0:
-                recorder.snapshot("controller", first * dt, self.controller.state())
-            if first % CHUNK == 0 and first > 0:
+                self._give_state(recorder)
+            if first == self.world.counts[CHUNK_START] + CHUNK:
                 self._begin_chunk(first)
             ends = [first + block, n_ticks, self._happen(first, recorder)]
             ends += [(first // every + 1) * every for every in (CHUNK, snapshot_every)]
@@ -251,7 +272,14 @@ class Simulation:
             self._run_block(first, count, recorder)
             if progress is not None:
                 progress(count)
-        recorder.snapshot("controller", n_ticks * dt, self.controller.state())
+        self._give_state(recorder)
+
+    def _give_state(self, recorder: Recorder) -> None:
+        """A snapshot of the present state, for a recorder that keeps it."""
+        if getattr(recorder, "keeps_snapshots", True):
+            t, state = self._tick * self.scenario.dt, self.state()
+            recorder.snapshot("controller", t, state.controller or {})
+            recorder.snapshot("world", t, state.world)
 
     def _happen(self, tick: int, recorder: Recorder) -> int:
         """Let every event up to this tick happen; the tick of the next one, or the last."""
@@ -296,14 +324,25 @@ class Simulation:
             raise self._why_it_ended()
 
     def _run_interpreted(self, first: int, count: int) -> None:
-        world = self.world
+        world, hooks = self.world, self.hooks
         for k in range(first, first + count):
-            if begin_tick(world, k):
+            in_time = begin_tick(world, k)
+            hooks.sense(k * world.dt, world.inputs.x)
+            if in_time:
                 began = time.perf_counter_ns()
                 self._command = self.controller.update(world.inputs)
                 world.counts[TOOK_NS] = time.perf_counter_ns() - began
-            if end_tick(world, self._command, k):
+            if self._end_hooked(k) if hooks else end_tick(world, self._command, k):
                 return
+
+    def _end_hooked(self, k: int) -> bool:
+        """End tick k with what imperfections from outside make of the command; log the command."""
+        world, asked, row = self.world, self._command.tau, self.world.counts[ROWS]
+        given = self._command._replace(tau=self.hooks.actuate(k * world.dt, asked))
+        ended = bool(end_tick(world, given, k))
+        if world.counts[ROWS] > row:
+            world.rows[row, self.layout.slices["tau_cmd"]] = asked
+        return ended
 
     def _why_it_ended(self) -> NonFiniteError:
         """The quantity that a tick found wrong, and its value."""
@@ -336,6 +375,11 @@ class Simulation:
             for i in np.flatnonzero(flag != before):
                 level, what = ("warning", begins) if flag[i] else ("info", ends)
                 recorder.event(Event(float(rows[i, 0]), level, what))
+
+
+def _finite(values: Array) -> bool:
+    """Whether all numbers are finite; texts are."""
+    return values.dtype.kind in "SU" or bool(np.isfinite(values).all())
 
 
 def simulate(scenario: Scenario, mjcf: Mjcf | None = None, *, watch: bool = True) -> Trace:

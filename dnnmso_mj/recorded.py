@@ -1,0 +1,91 @@
+"""A log read whole: for what goes on from it, and for what is compared with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mcap.records import Attachment
+
+from dnnmso_mj.assets import PREFIX
+from dnnmso_mj.errors import LogError
+from dnnmso_mj.log.format import snapshot_arrays, snapshot_place
+from dnnmso_mj.log.prefix import Prefix
+from dnnmso_mj.log.scan import Steps, scan
+from dnnmso_mj.log.segments import Segment, read_segments
+from dnnmso_mj.trace import StepLayout, Trace
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """All that a log holds.
+
+    Args:
+        path: of it.
+        trace: its columns, scenario, status and events.
+        layout: of its rows.
+        snapshots: npz files by tick and name.
+        files: its other attachments, by name.
+        segments: which scenario was in force when; one, unless the run was resumed.
+    """
+
+    path: Path
+    trace: Trace
+    layout: StepLayout
+    snapshots: Mapping[tuple[int, str], bytes]
+    files: Mapping[str, bytes]
+    segments: tuple[Segment, ...]
+
+    def arrays(self, tick: int, name: str) -> dict[str, Array]:
+        """A snapshot.
+
+        Raises:
+            LogError: it is damaged.
+        """
+        try:
+            return snapshot_arrays(self.snapshots[tick, name])
+        except ValueError as error:
+            t = tick * self.trace.scenario.dt
+            raise LogError(f"{self.path}: the snapshot {name} of {t:g} s is {error}") from error
+
+    @property
+    def assets(self) -> dict[str, bytes]:
+        """The files that its models name, by the names of their attachments."""
+        return {name: data for name, data in self.files.items() if name.startswith(PREFIX)}
+
+    def segment(self, tick: int) -> Segment:
+        """The one that a tick belongs to."""
+        return [part for part in self.segments if part.first <= tick][-1]
+
+
+def read_recorded(path: Path) -> Recorded:
+    """Read a log, complete or torn.
+
+    Raises:
+        LogError: the file is no log of this package, or holds not one tick.
+    """
+    steps = Steps()
+    log = scan(path, steps.add)
+    columns = steps.columns()
+    if columns is None:
+        raise log.error("holds no tick: the run ended before its first. Run it again")
+    trace = Trace(columns, log.scenario(), log.run(), tuple(log.events))
+    try:
+        segments = read_segments(log.metadata, trace.scenario)
+    except ValueError as error:
+        raise log.error(f"{error}. Read it with the version that wrote it") from error
+    snapshots, files = {}, {}
+    for record in Prefix(path):
+        if not isinstance(record, Attachment):
+            continue
+        place = snapshot_place(record.name)
+        if place is None:
+            files[record.name] = record.data
+        else:
+            snapshots[round(place[1] / trace.scenario.dt), place[0]] = record.data
+    layout = StepLayout(trace.n_joints, trace.n_layers)
+    return Recorded(path, trace, layout, snapshots, files, tuple(segments))
