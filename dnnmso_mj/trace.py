@@ -194,9 +194,10 @@ class Trace:
             MissingExtraError: pyarrow is not installed.
         """
         from dnnmso_mj.extras import require
-        from dnnmso_mj.trace_table import trace_table
 
         require("sweep", "Trace.table")
+        from dnnmso_mj.trace_table import trace_table
+
         return trace_table(self)
 
     def to_pandas(self) -> pd.DataFrame:

@@ -7,6 +7,7 @@ import json
 import os
 import pty
 import re
+import resource
 import select
 import struct
 import subprocess
@@ -161,13 +162,14 @@ def test_a_tab_imports_nothing_heavy(workplace):
     assert HEAVY & loaded == set()
 
 
-@pytest.mark.alone
 def test_a_tab_takes_less_than_half_a_second(workplace):
+    """Of the processor, bash included, so that what else runs here does not count."""
     took = []
     for _ in range(3):
-        began = time.perf_counter()
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
         asked("dnnmso run paper --set controller.network.", workplace)
-        took.append(time.perf_counter() - began)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        took.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
     assert min(took) < 0.5
 
 

@@ -33,7 +33,9 @@ def completion(
     """Print what makes a shell complete commands, names and keys.
 
     bash: eval "$(dnnmso completion bash)" in ~/.bashrc.
+
     zsh: eval "$(dnnmso completion zsh)" in ~/.zshrc, after compinit.
+
     fish: dnnmso completion fish > ~/.config/fish/completions/dnnmso.fish
     """
     from typer.completion import get_completion_script
