@@ -29,6 +29,7 @@ _PLOT = {"matplotlib": "matplotlib", "pillow": "PIL"}
 _SWEEP = {"pyarrow": "pyarrow"}
 _TORCH = {"torch": "torch"}
 _DM_CONTROL = {"dm-control": "dm_control"}
+_ENVIRONMENTS = _DM_CONTROL | {"gymnasium": "gymnasium"}
 EXTRAS = {
     "viewer": Extra("seeing the arm: dnnmso replay", {"rerun-sdk": "rerun"}),
     "plot": Extra("figures of dnnmso run, plot and audit", _PLOT),
@@ -38,15 +39,11 @@ EXTRAS = {
     "ray": Extra("dnnmso sweep --engine ray", _SWEEP | {"ray": "ray"}),
     "reference": Extra("controller.network.backend = torch", _TORCH),
     "dm-control": Extra("the model in dm_control's Physics", _DM_CONTROL),
+    "environments": Extra("environments of dm_control and Gymnasium", _ENVIRONMENTS),
+    "policy": Extra("policies in ONNX files", {"onnxruntime": "onnxruntime"}),
     "bench": Extra(
         "all that dnnmso bench compares with",
-        {
-            **_SWEEP,
-            **_TORCH,
-            **_DM_CONTROL,
-            "gymnasium": "gymnasium",
-            "mcap-protobuf-support": "mcap_protobuf",
-        },
+        {**_SWEEP, **_TORCH, **_ENVIRONMENTS, "mcap-protobuf-support": "mcap_protobuf"},
     ),
 }
 
