@@ -102,7 +102,8 @@ def _schema() -> dict[str, Any]:
 def _kinds() -> list[str]:
     schema = _schema()
     controllers = _alternatives(schema, schema["properties"]["controller"], None)
-    return [part["properties"]["kind"]["const"] for part in controllers if _kind_of(part)]
+    by_themselves = (part for part in controllers if set(part.get("required", ())) <= {"kind"})
+    return [kind for part in by_themselves if (kind := _kind_of(part))]
 
 
 def _chosen_kinds(scenario: str | None, overrides: Iterable[str]) -> dict[str, str]:
