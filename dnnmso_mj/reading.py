@@ -13,6 +13,7 @@ from dnnmso_mj.errors import LogError
 from dnnmso_mj.log.format import create, snapshot_arrays, snapshot_place, unwritable
 from dnnmso_mj.log.prefix import Prefix, copy
 from dnnmso_mj.log.scan import Steps, scan
+from dnnmso_mj.log.segments import RESUMED
 from dnnmso_mj.log.writer import LogWriter
 from dnnmso_mj.trace import Event, Trace
 
@@ -39,6 +40,7 @@ class LogInfo:
     channels: Mapping[str, int]  # topic -> number of messages
     attachments: Mapping[str, int]  # name -> bytes
     events: tuple[Event, ...]
+    resumed: Mapping[str, str]  # the log that it went on from, at which time, with which changes
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,7 @@ def log_info(path: str | Path) -> LogInfo:
         channels=log.counts,
         attachments=log.attachments,
         events=tuple(log.events),
+        resumed=log.metadata.get(RESUMED, {}),
     )
 
 

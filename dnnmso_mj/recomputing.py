@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +25,21 @@ Array = np.ndarray
 SNAPSHOTS = ("controller", "world")
 
 
-def state_at(source: Recorded, segment: Segment, mjcf: Mjcf, tick: int) -> tuple[State | None, int]:
+class Found(NamedTuple):
+    """What computing again has found.
+
+    Args:
+        state: before the tick; None before tick 0.
+        checked: how many ticks were computed again.
+        events: that happened in them.
+    """
+
+    state: State | None
+    checked: int
+    events: list[Event]
+
+
+def state_at(source: Recorded, segment: Segment, mjcf: Mjcf, tick: int) -> Found:
     """The state that a log's run was in before a tick.
 
     Args:
@@ -33,26 +48,23 @@ def state_at(source: Recorded, segment: Segment, mjcf: Mjcf, tick: int) -> tuple
         mjcf: the segment's model.
         tick: at most the number of ticks in the log.
 
-    Returns:
-        The state, None before tick 0; and how many ticks were computed again to find it.
-
     Raises:
         LogError: one of them is not what the log says, or the run ended there.
     """
     if tick == 0:
-        return None, 0
+        return Found(None, 0, [])
     simulation = Simulation(segment.scenario, mjcf)
     start = _nearest(source, segment, tick)
     state = _snapshot(source, simulation, start) if start else None
     if start == tick:
-        return state, 0
+        return Found(state, 0, [])
     _refuse_missed(source, start, tick)
     check = _Check(source, simulation.layout, start)
     info = simulation.run(check, start=state, until=tick)
     if info.status == "diverged":
         last = (tick - 1) * segment.scenario.dt
         raise LogError(f"{source.path}: {info.reason}; allowed: --at {last:g} or before")
-    return simulation.state(), tick - start
+    return Found(simulation.state(), tick - start, check.events)
 
 
 def _nearest(source: Recorded, segment: Segment, tick: int) -> int:
@@ -113,6 +125,7 @@ class _Check:
     keeps_snapshots = False
 
     def __init__(self, source: Recorded, layout: StepLayout, start: int) -> None:
+        self.events: list[Event] = []
         self._source, self._layout, self._done = source, layout, start
 
     def append(self, rows: Array) -> None:
@@ -135,7 +148,7 @@ class _Check:
         self._done += len(rows)
 
     def event(self, event: Event) -> None:
-        """Events follow from the rows."""
+        self.events.append(event)
 
     def snapshot(self, name: str, t: float, arrays: Mapping[str, Array]) -> None:
         """None is kept."""

@@ -9,34 +9,24 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
-
-import numpy as np
 
 from dnnmso_mj.assets import put_back, read_assets
 from dnnmso_mj.branching import branch
+from dnnmso_mj.continuing import Continuation, Model
 from dnnmso_mj.errors import LogError, ScenarioError
 from dnnmso_mj.loading.changing import change_scenario
-from dnnmso_mj.log.format import MODEL
-from dnnmso_mj.log.segments import RESUMED, SEGMENTS, Segment, segments_record
-from dnnmso_mj.memory_recorder import LARGEST_BLOCK
+from dnnmso_mj.log.segments import Segment
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.recomputing import state_at
 from dnnmso_mj.recorded import Recorded, read_recorded
-from dnnmso_mj.recording import McapRecorder
-from dnnmso_mj.run import LoggedRun, run_to_end
-from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulation import Progress, Recorder, Simulation
-from dnnmso_mj.trace import Event, RunInfo, StepLayout
-from dnnmso_mj.world_state import State
-
-Array = np.ndarray
+from dnnmso_mj.run import LoggedRun
+from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.simulation import Progress, Simulation
 
 
 @dataclass(frozen=True)
@@ -88,92 +78,43 @@ def resume(
     if out is not None and out.resolve() == log.resolve():
         raise LogError(f"--out {out}: is the log itself; allowed: another name")
     tick = _tick(source, at)
-    segment = source.segment(tick)
-    scenario = change_scenario(segment.scenario, sets, log, trust=trust)
+    scenario = change_scenario(source.segment(tick).scenario, sets, log, trust=trust)
     if scenario.n_ticks < tick:
         raise ScenarioError(
             f"duration = {scenario.duration:g}: ends before --at {at:g}; allowed: {at:g} or more"
         )
     with TemporaryDirectory(prefix="dnnmso-") as folder:
-        own = _model(source, segment, Path(folder))
-        same = scenario.plant.model == segment.scenario.plant.model
-        model = own if same else _model_file(scenario.plant.model)
-        simulation = Simulation(scenario, model.mjcf)
-        state, checked = state_at(source, segment, own.mjcf, tick)
-        last = segment
-        if scenario != segment.scenario:
-            told = ""
-            if state is not None:
-                state, became = branch(state, segment.scenario, simulation)
-                told = f"resumed from {log.name} with {', '.join(sets)}; {became}"
-            last = Segment(tick, scenario, told=told)
+        rest, checked = _prepare(source, tick, scenario, ", ".join(sets), Path(folder))
         where = {"source": log.name, "at": repr(at), "sets": json.dumps(list(sets))}
-        target = out or _free_name(log, tick * scenario.dt)
-        follow = _Continuation(source, tick, last, state, simulation, model)
-        done = follow.record(target, where, force, progress)
-    return Resumed(done, tick, checked, last.told if last.first == tick else "")
+        done = rest.record(out or _free_name(log, tick * scenario.dt), where, force, progress)
+    return Resumed(done, tick, checked, rest.last.told if rest.last.first == tick else "")
 
 
-@dataclass(frozen=True)
-class _Continuation:
-    """What is left to run, and the log that it goes on from.
+def _prepare(
+    source: Recorded, tick: int, scenario: Scenario, changes: str, folder: Path
+) -> tuple[Continuation, int]:
+    """What is left to run, and how many ticks before it were computed again.
 
     Args:
         source: the log.
         tick: of it, to go on from.
-        last: the segment to go on with.
-        state: to go on in; None: at the start.
-        simulation, model: of that segment.
+        scenario: to go on in.
+        changes: in words.
+        folder: for the files of models.
     """
-
-    source: Recorded
-    tick: int
-    last: Segment
-    state: State | None
-    simulation: Simulation
-    model: _Model
-
-    def record(
-        self, out: Path, where: dict[str, str], force: bool, progress: Progress | None
-    ) -> LoggedRun:
-        """Write the whole run; `where` says what it goes on from."""
-        scenario, ours, theirs = self.last.scenario, self.simulation.layout, self.source.layout
-        layout = ours if ours.n_layers >= theirs.n_layers else theirs
-        segments, files = self._history()
-        records = {RESUMED: where, **({SEGMENTS: segments_record(segments)} if segments else {})}
-        scene = Scene(self.simulation.plant.model)
-        with McapRecorder(
-            out, layout, scenario, scene, self.model.text, force=force, records=records, files=files
-        ) as recorder:
-
-            def run() -> RunInfo:
-                _copy_before(self.source, self.tick, _Widened(recorder, theirs, layout))
-                return self._go_on(_Widened(recorder, ours, layout), progress)
-
-            return run_to_end(run, recorder, scenario, layout)
-
-    def _go_on(self, recorder: Recorder, progress: Progress | None) -> RunInfo:
-        state, simulation = self.state, self.simulation
-        if state is not None and self.last.first == self.tick:
-            t = self.tick * self.last.scenario.dt
-            recorder.event(Event(t, "info", self.last.told))
-            if self.tick % simulation.snapshot_every:  # else the run keeps one
-                recorder.snapshot("controller", t, state.controller or {})
-                recorder.snapshot("world", t, state.world)
-        return simulation.run(recorder, progress, start=state)
-
-    def _history(self) -> tuple[list[Segment], dict[str, bytes]]:
-        """The segments, if there are several, and the models that are not the log's own."""
-        segments, files = [], dict(self.model.files)
-        for part in self.source.segments:
-            if part.first < self.last.first:
-                text = self.source.files[part.model]
-                own = text == self.model.text.encode()
-                name = MODEL if own else f"model-{part.first}.xml"
-                segments.append(replace(part, model=name))
-                if not own:
-                    files |= {name: text, **self.source.assets}
-        return [*segments, replace(self.last, model=MODEL)] if segments else [], files
+    segment = source.segment(tick)
+    own = _model(source, segment, folder)
+    same = scenario.plant.model == segment.scenario.plant.model
+    model = own if same else _model_file(scenario.plant.model)
+    simulation = Simulation(scenario, model.mjcf)
+    state, checked, events = state_at(source, segment, own.mjcf, tick)
+    if scenario != segment.scenario:
+        told = ""
+        if state is not None:
+            state, became = branch(state, segment.scenario, simulation)
+            told = f"resumed from {source.path.name} with {changes}; {became}"
+        segment = Segment(tick, scenario, told=told)
+    return Continuation(source, tick, events, segment, state, simulation, model), checked
 
 
 def _tick(source: Recorded, at: float) -> int:
@@ -184,74 +125,18 @@ def _tick(source: Recorded, at: float) -> int:
     return round(at / dt)
 
 
-class _Model(NamedTuple):
-    """A model and all that a log keeps of it."""
-
-    mjcf: Mjcf
-    text: str
-    files: Mapping[str, bytes]
-
-
-def _model(source: Recorded, segment: Segment, folder: Path) -> _Model:
+def _model(source: Recorded, segment: Segment, folder: Path) -> Model:
     """The model of a segment, from the log alone; its meshes go to a folder."""
     data = source.files.get(segment.model)
     if data is None:
         raise LogError(f"{source.path}: has no attachment {segment.model}; it cannot be resumed")
     text = data.decode()
-    return _Model(put_back(text, source.assets, folder), text, source.assets)
+    return Model(put_back(text, source.assets, folder), text, source.assets)
 
 
-def _model_file(name: str) -> _Model:
+def _model_file(name: str) -> Model:
     mjcf = Mjcf.read(find_model(name))
-    return _Model(mjcf, mjcf.text, read_assets(mjcf))
-
-
-def _copy_before(source: Recorded, tick: int, recorder: Recorder) -> None:
-    """Rows, events and snapshots before a tick, in their order."""
-    dt, rows = source.trace.scenario.dt, source.layout.rows(source.trace.columns)[:tick]
-    marks: list[tuple[int, Callable[[], None]]] = []
-    for event in source.trace.events:
-        marks.append((round(event.t / dt), partial(recorder.event, event)))
-    for k, name in source.snapshots:
-        arrays = source.arrays(k, name)
-        marks.append((k, partial(recorder.snapshot, name, k * dt, arrays)))
-    done = 0
-    for k, give in sorted(marks, key=lambda mark: mark[0]):
-        if k >= tick:
-            break
-        _append(recorder, rows[done:k])
-        done = k
-        give()
-    _append(recorder, rows[done:])
-
-
-def _append(recorder: Recorder, rows: Array) -> None:
-    for first in range(0, len(rows), LARGEST_BLOCK):
-        recorder.append(rows[first : first + LARGEST_BLOCK])
-
-
-class _Widened:
-    """A recorder of rows with as many layers as either controller has.
-
-    Args:
-        recorder: takes the wider rows.
-        layout: of the rows given.
-        wider: of those taken.
-    """
-
-    def __init__(self, recorder: McapRecorder, layout: StepLayout, wider: StepLayout) -> None:
-        self._recorder, self._layout, self._wider = recorder, layout, wider
-
-    def append(self, rows: Array) -> None:
-        if self._layout != self._wider:
-            rows = self._wider.rows(self._layout.columns(rows))
-        self._recorder.append(rows)
-
-    def event(self, event: Event) -> None:
-        self._recorder.event(event)
-
-    def snapshot(self, name: str, t: float, arrays: Mapping[str, Array]) -> None:
-        self._recorder.snapshot(name, t, arrays)
+    return Model(mjcf, mjcf.text, read_assets(mjcf))
 
 
 def _free_name(log: Path, at: float) -> Path:

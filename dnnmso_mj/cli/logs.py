@@ -86,11 +86,12 @@ def info(log: Log, as_json: Json = False) -> None:
         "attachments": f"{len(found.attachments)} ({sum(found.attachments.values()) / 1e6:.2f} MB)",
         "versions": listing(found.versions),
         "commit": found.git_commit or "unknown",
+        **({"resumed": listing(found.resumed)} if found.resumed else {}),
     }
     for name, value in rows.items():
         table.add_row(name, str(value))
-    for name, value in found.metrics.items():
-        table.add_row(name, number(value))
+    for name, metric in found.metrics.items():
+        table.add_row(name, number(metric))
     for event in found.events:
         table.add_row(f"event {event.t:.3f} s", f"{event.level}: {event.message}")
     print_table(table)

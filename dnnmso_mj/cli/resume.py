@@ -26,6 +26,7 @@ from dnnmso_mj.wording import show
 
 if TYPE_CHECKING:
     from dnnmso_mj.difference import Difference, Place
+    from dnnmso_mj.resume import Resumed
 
 DIFFERENT = 1
 MOST_TOLD = 20  # events, or snapshots
@@ -52,29 +53,9 @@ def resume(
             done = resume_log(log, at, sets, out, force=force, trust=trust, progress=progress)
     except RunInterrupted as stop:
         raise KeyboardInterrupt(f"log: {near(stop.log)} ({stop.ticks} ticks)") from stop
-    trace, info = done.run.trace, done.run.trace.info
     figures, undrawn = draw(done.run) if plot else ([], None)
-    t = done.tick * trace.scenario.dt
-    if as_json:
-        print(json.dumps({
-            "status": info.status,
-            "reason": info.reason,
-            "scenario": trace.scenario.name,
-            "source": str(log),
-            "at": t,
-            "checked_ticks": done.checked,
-            "changed": list(sets),
-            "log": str(done.run.log),
-            "figures": [str(figure) for figure in figures],
-            "seed": info.seed,
-            "wall_s": info.wall_s,
-            "metrics": dict(info.metrics),
-        }))  # fmt: skip
-    else:
-        print_summary(trace, done.run.log, figures, since=done.tick)
-        print(f"resumed  {near(log)} at {t:g} s; {done.checked} ticks before that are as computed")
-        if done.told:
-            print(f"changed  {done.told}")
+    _tell(done, log, sets, figures, as_json=as_json)
+    info = done.run.trace.info
     if undrawn is not None:
         raise undrawn
     if info.status == "diverged":
@@ -82,15 +63,44 @@ def resume(
         raise typer.Exit(DIVERGED)
 
 
+def _tell(
+    done: Resumed, source: Path, sets: list[str], figures: list[Path], *, as_json: bool
+) -> None:
+    trace, info = done.run.trace, done.run.trace.info
+    t = done.tick * trace.scenario.dt
+    if as_json:
+        print(json.dumps({
+            "status": info.status,
+            "reason": info.reason,
+            "scenario": trace.scenario.name,
+            "source": str(source),
+            "at": t,
+            "checked_ticks": done.checked,
+            "changed": sets,
+            "log": str(done.run.log),
+            "figures": [str(figure) for figure in figures],
+            "seed": info.seed,
+            "wall_s": info.wall_s,
+            "metrics": dict(info.metrics),
+        }))  # fmt: skip
+        return
+    print_summary(trace, done.run.log, figures, since=done.tick)
+    print(
+        f"resumed  {near(source)} at {t:g} s; the {done.checked} ticks before were computed again"
+    )
+    if done.told:
+        print(f"branch   {done.told}")
+
+
 def diff(
-    one: Annotated[Path, typer.Argument(metavar="A", help="A log that `dnnmso run` wrote.")],
-    other: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
+    log: Log,
+    other: Log,
     as_json: Json = False,
 ) -> None:
     """Say where two logs first differ, and by how much; exit status 1 if they do."""
     from dnnmso_mj.difference import difference
 
-    found = difference(one, other)
+    found = difference(log, other)
     if as_json:
         print(json.dumps(found.plain()))
     else:
