@@ -11,19 +11,17 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from mcap.records import Attachment
-
+from dnnmso_mj.assets import put_back
 from dnnmso_mj.errors import DnnmsoError, LogError, ScenarioError
+from dnnmso_mj.extras import require
 from dnnmso_mj.log.format import MODEL, unwritable
-from dnnmso_mj.log.prefix import Prefix
-from dnnmso_mj.plant import Mjcf, build_spec, compile_spec
-from dnnmso_mj.reading import read_snapshots, read_trace
-from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.plant import build_spec, compile_spec
+from dnnmso_mj.reading import Snapshot
+from dnnmso_mj.recorded import Recorded, read_recorded
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.viewer.plot import TIMELINE
 from dnnmso_mj.viewer.process import (
     check_display,
-    check_rerun,
     free_port,
     headless_viewer,
     picture,
@@ -147,16 +145,24 @@ def _several(logs: Logs) -> Sequence[Path]:
 
 def _convert(logs: Sequence[Path], out: Path, first_tab: str, side_by_side: bool) -> float:
     """Write the recording of some logs; returns the last time in it (s)."""
-    check_rerun()
+    require("viewer", "the viewer")
     from dnnmso_mj.viewer.rrd import Run, rrd_bytes
 
     runs = []
     for name, log in zip(run_names(logs), logs, strict=True):
-        trace = read_trace(log)
-        runs.append(Run(name, trace, _scene(log, trace.scenario), read_snapshots(log)))
+        found = read_recorded(log)
+        snapshots = _snapshots(found)
+        runs.append(Run(name, found.trace, _scene(found), snapshots, found.segments))
     out.write_bytes(rrd_bytes(runs, first_tab, side_by_side=side_by_side))
     last_ticks = [float(run.trace["t"][-1]) for run in runs]
     return max([*last_ticks, *(snapshot.t for run in runs for snapshot in run.snapshots)])
+
+
+def _snapshots(log: Recorded) -> list[Snapshot]:
+    """The states of its controller, in the order of time."""
+    name, dt = "controller", log.trace.scenario.dt
+    ticks = sorted(tick for tick, what in log.snapshots if what == name)
+    return [Snapshot(name, tick * dt, log.arrays(tick, name)) for tick in ticks]
 
 
 def run_names(logs: Sequence[Path]) -> list[str]:
@@ -175,21 +181,19 @@ def run_names(logs: Sequence[Path]) -> list[str]:
     return [f"{name} ({k + 1})" if k else name for name, k in zip(names, before, strict=True)]
 
 
-def _scene(log: Path, scenario: Scenario) -> Scene:
-    """The robot of a log, from the model that the log holds and the scenario's masses and lengths.
-
-    N.B. meshes and includes are not in the log: they are looked for where the model was.
-    """
-    records = (r for r in Prefix(log) if isinstance(r, Attachment) and r.name == MODEL)
-    model = next(records, None)
-    if model is None:
-        raise LogError(f"{log}: no attachment {MODEL!r} to draw the robot from. Run it again.")
-    plant = scenario.plant
+def _scene(log: Recorded) -> Scene:
+    """The robot of a log, from the model that it holds and its scenario's masses and lengths."""
+    data = log.files.get(MODEL)
+    if data is None:
+        raise LogError(f"{log.path}: no attachment {MODEL!r} to draw the robot from. Run it again.")
+    scenario = log.trace.scenario
     try:
-        mjcf = Mjcf(model.data.decode(), str(Path(plant.model).parent))
-        return Scene(compile_spec(build_spec(plant, scenario.dt, mjcf), plant.model))
+        with tempfile.TemporaryDirectory() as folder:
+            mjcf = put_back(data.decode(), log.assets, Path(folder))
+            spec = build_spec(scenario.plant, scenario.dt, mjcf)
+            return Scene(compile_spec(spec, scenario.plant.model))
     except (ScenarioError, UnicodeDecodeError) as error:
-        raise LogError(f"{log}: its robot cannot be drawn: {error}") from error
+        raise LogError(f"{log.path}: its robot cannot be drawn: {error}") from error
 
 
 @contextlib.contextmanager

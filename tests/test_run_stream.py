@@ -14,6 +14,7 @@ from replay_samples import entities, read_bands, read_component, read_times
 from trace_samples import trace_with
 
 from dnnmso_mj.errors import LogError
+from dnnmso_mj.log.segments import Segment
 from dnnmso_mj.network import network_shape
 from dnnmso_mj.reading import Snapshot
 from dnnmso_mj.replay import run_names
@@ -142,12 +143,32 @@ def test_the_scale_of_the_weights_grows_with_them_for_all_pictures(tmp_path: Pat
     )
 
 
-def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
-    other = [Snapshot("controller", 0.0, {"weights": np.ones(7)})]
-    with pytest.raises(LogError, match="a snapshot has 7 weights"):
-        sent(tmp_path / "run.rrd", trace(), 50, other)
-    with pytest.raises(LogError, match="a snapshot has no 'weights'"):
-        sent(tmp_path / "run.rrd", trace(), 50, [Snapshot("controller", 0.0, {})])
+def test_states_of_another_controller_leave_a_gap(tmp_path: Path) -> None:
+    """As before the branch of a run that went on with another."""
+    run = trace()
+    others = [{}, {"weights": np.ones(7)}, weights(run.scenario, 1)]
+    snapshots = [Snapshot("controller", 0.05 * k, state) for k, state in enumerate(others)]
+    rrd = sent(tmp_path / "run.rrd", run, 50, snapshots)
+    assert read_times(rrd, "weights/W1") / np.timedelta64(1, "s") == [0.1]
+
+
+def test_bands_are_of_the_scenario_in_force(tmp_path: Path) -> None:
+    from dnnmso_mj.viewer.rrd import Run, rrd_bytes
+
+    frozen = trace(events=[{"kind": "freeze", "at": 0.0}])
+    segments = [Segment(0, trace().scenario), Segment(40, frozen.scenario)]
+    out = tmp_path / "branched.rrd"
+    out.write_bytes(rrd_bytes([Run("branched", frozen, scene(), (), segments)]))
+    assert read_bands(out, "learning") == [(0.0, ""), (0.04, "learning has ended")]
+    assert len(read_times(out, "plots/torque/lines")) == N_TICKS
+
+
+def test_to_look_at_a_run_calls_no_code_from_outside(tmp_path: Path) -> None:
+    run = trace(reference={"kind": "external", "python": "no_such_module:motion"})
+    rrd = sent(tmp_path / "run.rrd", run, 50)
+    drawn = read_component(rrd, "trail/desired", "LineStrips3D:strips")
+    way = scene().tip(run["q_ref"][::10])
+    np.testing.assert_allclose(np.array(drawn)[:, 0, 1], way, atol=1e-6)
 
 
 def test_each_run_has_its_name_and_colour_and_the_reference_is_there_once(tmp_path: Path) -> None:

@@ -8,14 +8,16 @@ from typing import Annotated
 
 import typer
 
-from dnnmso_mj.cli.shared import Json, Log, listing, number, print_table, working
+from dnnmso_mj.cli.shared import Json, Log, Logs, listing, number, print_table, working
+from dnnmso_mj.extras import require
 
 
 def plot(
-    logs: Annotated[list[Path], typer.Argument(help="One log, or several to compare.")],
+    logs: Logs,
     out: Annotated[Path | None, typer.Option(help="Folder; default beside the first log.")] = None,
 ) -> None:
-    """Draw the paper's figures and the theory from logs."""
+    """Draw the paper's figures and the theory from logs; several are compared."""
+    require("plot", "dnnmso plot")
     from dnnmso_mj.plots import save_comparison, save_figures
     from dnnmso_mj.reading import read_trace
 
@@ -35,7 +37,7 @@ def plot(
 
 
 def replay(
-    logs: Annotated[list[Path], typer.Argument(help="A log, or up to eight to compare.")],
+    logs: Logs,
     save: Annotated[Path | None, typer.Option(help="Write a Rerun recording (.rrd).")] = None,
     screenshot: Annotated[Path | None, typer.Option(help="Write a picture (.png).")] = None,
     serve: Annotated[bool, typer.Option(help="Serve the web viewer on 127.0.0.1.")] = False,
@@ -46,7 +48,8 @@ def replay(
         bool, typer.Option(help="The arms of several logs beside, not in one another.")
     ] = False,
 ) -> None:
-    """Open logs in the Rerun viewer."""
+    """Open a log, or up to eight to compare, in the Rerun viewer."""
+    require("viewer", "dnnmso replay")
     from dnnmso_mj import replay as viewer
 
     if save is not None:

@@ -10,7 +10,7 @@ import rerun as rr
 
 from dnnmso_mj.reference import Reference
 from dnnmso_mj.rotations import from_rotation_vector
-from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.scenario import ExternalReference, Scenario
 from dnnmso_mj.scene import WORLD, Geom, Joint, Scene
 from dnnmso_mj.viewer.blueprint import ARM, DESIRED, TRAIL
 from dnnmso_mj.viewer.look import Look, Point
@@ -53,12 +53,12 @@ class ArmPicture:
         self._look = look
         self._reach = scene.reach
         self._stride = _stride(scenario)
-        self._trail = f"{root}{TRAIL}/actual"
+        self._trail, self._desired_trail = f"{root}{TRAIL}/actual", f"{root}{TRAIL}/desired"
         self._roots = [root + name for name in (ARM, DESIRED, TRAIL)]
         self._frames = _frames(scene, self._roots[0])
         self._ghost_frames = _frames(scene, self._roots[1])
         self._path = _desired_path(scenario, scene)
-        self._last_tip: Array | None = None
+        self._last: dict[str, Array] = {}  # where each trail has come to
 
     def begin(self) -> None:
         """What does not move: shapes, pins, the desired path, and the style of the trail."""
@@ -77,10 +77,12 @@ class ArmPicture:
                 pin = _pin(link.joint, 0.02 * reach)
                 recording.log(f"{self._frames[link.name]}/shapes/pin", pin, static=True)
         radius = 0.004 * reach
-        if self._look.ghost:
-            # Thinner than the trail, which so covers it where the tip has kept to it.
-            path = rr.LineStrips3D([self._path], colors=PATH_RGB, radii=0.6 * radius)
-            recording.log(f"{self._roots[2]}/desired", path, static=True)
+        # Thinner than the trail, which so covers it where the tip has kept to it.
+        style = rr.LineStrips3D.from_fields(colors=[PATH_RGB], radii=[0.6 * radius])
+        recording.log(self._desired_trail, style, static=True)
+        if self._look.ghost and self._path is not None:
+            path = rr.LineStrips3D.from_fields(strips=[self._path])
+            recording.log(self._desired_trail, path, static=True)
         color = self._look.color or TRAIL_RGB
         style = rr.LineStrips3D.from_fields(colors=[color], radii=[radius])
         recording.log(self._trail, style, static=True)
@@ -100,13 +102,18 @@ class ArmPicture:
         self._send_frames(self._frames, times, q[drawn])
         if self._look.ghost:
             self._send_frames(self._ghost_frames, times, q_ref[drawn])
-        # Each stretch at the time it is gone, so that the past makes a trail.
-        tip = self._scene.tip(q[drawn])
+        self._draw_on(self._trail, times, q[drawn])
+        if self._look.ghost and self._path is None:
+            self._draw_on(self._desired_trail, times, q_ref[drawn])
+
+    def _draw_on(self, trail: str, times: Sequence[rr.TimeColumn], q: Array) -> None:
+        """Each stretch of a tip's way at the time it is gone, so that the past makes a trail."""
+        tip = self._scene.tip(q)
         before = np.roll(tip, 1, axis=0)
-        before[0] = tip[0] if self._last_tip is None else self._last_tip
-        self._last_tip = tip[-1]
+        before[0] = self._last.get(trail, tip[0])
+        self._last[trail] = tip[-1]
         stretches = np.stack([before, tip], axis=1)  # (m, 2, 3)
-        self._recording.send_columns(self._trail, times, rr.LineStrips3D.columns(strips=stretches))
+        self._recording.send_columns(trail, times, rr.LineStrips3D.columns(strips=stretches))
 
     def _send_frames(
         self, frames: dict[str, str], times: Sequence[rr.TimeColumn], q: Array
@@ -121,7 +128,10 @@ class ArmPicture:
 def stage(scenario: Scenario, scene: Scene) -> tuple[Point, float]:
     """Centre and half size (m) of what a camera must show, known before a run begins."""
     start = scene.tip(np.array([scenario.initial.q]))
-    points = np.concatenate([np.zeros((1, 3)), start, _desired_path(scenario, scene)])
+    path = _desired_path(scenario, scene)
+    if path is None:
+        return (0.0, 0.0, 0.0), scene.reach
+    points = np.concatenate([np.zeros((1, 3)), start, path])
     low, high = points.min(axis=0), points.max(axis=0)
     x, y, z = map(float, (low + high) / 2)
     return (x, y, z), max(float((high - low).max()) / 2, 0.4 * scene.reach) + 0.1 * scene.reach
@@ -132,8 +142,13 @@ def _stride(scenario: Scenario) -> int:
     return max(1, math.ceil(POSE_PERIOD / scenario.dt - 1e-9))
 
 
-def _desired_path(scenario: Scenario, scene: Scene) -> Array:
-    """Where the tip should be over the run, (m, 3) m."""
+def _desired_path(scenario: Scenario, scene: Scene) -> Array | None:
+    """Where the tip should be over the run, (m, 3) m; None of a reference from outside.
+
+    To look at a run calls no code from outside.
+    """
+    if isinstance(scenario.reference, ExternalReference):
+        return None
     stride = max(_stride(scenario), math.ceil(scenario.n_ticks / _PATH_POINTS))
     t = np.arange(0, scenario.n_ticks, stride) * scenario.dt
     q_ref, _, _ = Reference(scenario.reference, scenario.n_joints).sample(t)

@@ -13,6 +13,7 @@ from dnnmso_mj.viewer.look import Point
 from dnnmso_mj.viewer.plot import TIMELINE, Plot
 
 ARM, DESIRED, TRAIL = "arm", "desired", "trail"
+WAYS = ("actual", "desired")
 PLOTS, EVENTS, SUMMARY = "plots", "events", "summary"
 WEIGHTS, RATIOS = "weights", "weight_ratios"
 
@@ -173,7 +174,7 @@ def _arm_view(runs: Sequence[Shown], name: str, aspect: float) -> rrb.Spatial3DV
         origin="/",
         contents=[f"{root}/**" for root in roots],
         name=name,
-        overrides={f"{run.prefix}{TRAIL}/actual": [past] for run in runs},
+        overrides={f"{run.prefix}{TRAIL}/{way}": [past] for run in runs for way in WAYS},
         # At this distance the default field of view holds a little more than the half size.
         eye_controls=rrb.EyeControls3D(
             position=(x, y - 2.0 * half_size, z + 0.2 * half_size),

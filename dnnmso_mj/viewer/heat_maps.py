@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 import rerun as rr
 
-from dnnmso_mj.errors import LogError
 from dnnmso_mj.network import network_shape
 from dnnmso_mj.scenario import DnnMsoReplay, LewisNn, Network, RbfMso, Scenario
 from dnnmso_mj.trace import Array
@@ -42,12 +41,11 @@ class HeatMaps:
     def send(self, t: float, state: Mapping[str, Array]) -> None:
         """The matrices in a controller's state at t (s).
 
-        Raises:
-            LogError: the state is not one of this scenario's controller.
+        A state of another controller, as before the branch of a resumed run, leaves a gap.
         """
-        if not self.names:
-            return
         matrices = weight_matrices(self._scenario, state)
+        if matrices is None:
+            return
         self._first = self._first or matrices
         for name, W, W0 in zip(self.names, matrices, self._first, strict=True):
             self._send(f"{self._root}{WEIGHTS}/{name}", t, W)
@@ -86,25 +84,21 @@ def weight_names(scenario: Scenario) -> tuple[list[str], set[str]]:
     return [f"W{k + 1}" for k in range(len(network.hidden) + 1)] if network else [], set()
 
 
-def weight_matrices(scenario: Scenario, state: Mapping[str, Array]) -> list[Array]:
+def weight_matrices(scenario: Scenario, state: Mapping[str, Array]) -> list[Array] | None:
     """The matrices that `weight_names` names, (outputs, inputs) each, from a controller's state.
 
-    Raises:
-        LogError: the state is not one of this scenario's controller.
+    None where the state is not one of this scenario's controller.
     """
     network, n = _network(scenario), scenario.n_joints
-    try:
-        if network is None:
-            return [state[name].T for name in weight_names(scenario)[0]]
-        flat = state["weights"]
-    except KeyError as error:
-        kind = scenario.controller.kind
-        raise LogError(f"a snapshot has no {error}; expected what a {kind} learns") from error
+    if network is None:
+        names, _ = weight_names(scenario)
+        return [state[name].T for name in names] if set(names) <= set(state) else None
+    flat = state.get("weights", np.zeros(0))
     for n_out in (n, 2 * n):
         shape = network_shape(network, 2 * n, n_out)
         if shape.n_weights == flat.size:
             return shape.split(flat)
-    raise LogError(f"a snapshot has {flat.size} weights; expected those of the scenario's network")
+    return None
 
 
 def log_ratio(W: Array, W0: Array) -> Array:

@@ -59,8 +59,9 @@ class Lanes:
         self._root = root
         self._lanes = lanes(scenario, darker(look.color) if look.color else GOOD)
         self.names = [lane.name for lane in self._lanes]
-        self._last = dict.fromkeys(self.names, -1)
+        self._last: dict[str, str | None] = dict.fromkeys(self.names)
         self._tick = 0
+        self._in_force = (scenario, self._lanes)
 
     def begin(self) -> None:
         """The colour of each state."""
@@ -73,14 +74,19 @@ class Lanes:
             self._recording.log(self._root + lane.name, style, static=True)
 
     def send(self, trace: Trace, ticks: Array) -> None:
-        """The changes in a stretch of ticks (N,)."""
+        """The changes in a stretch of ticks (N,), under the scenario that was in force in it."""
+        scenario = trace.scenario
+        if scenario is not self._in_force[0]:
+            self._in_force = (scenario, lanes(scenario))
+        in_force = {lane.name: lane for lane in self._in_force[1]}
         for lane in self._lanes:
-            states = lane.states(trace, ticks)
-            before = np.concatenate([[self._last[lane.name]], states[:-1]])
-            changes = np.flatnonzero(states != before)
-            self._last[lane.name] = int(states[-1])
-            words = [lane.words[state] for state in states[changes]]
-            self._send(lane, ticks[changes], words)
+            then = in_force.get(lane.name)
+            words = np.array(then.words if then else [GONE], dtype=object)
+            said = words[then.states(trace, ticks) if then else np.zeros(len(ticks), int)]
+            before = np.concatenate([[self._last[lane.name]], said[:-1]])
+            changes = np.flatnonzero(said != before)
+            self._last[lane.name] = said[-1]
+            self._send(lane, ticks[changes], said[changes].tolist())
         self._tick = int(ticks[-1])
 
     def end(self, status: str) -> None:

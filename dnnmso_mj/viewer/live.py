@@ -21,6 +21,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from dnnmso_mj.errors import DnnmsoError
+from dnnmso_mj.extras import require
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.sources import python_path
@@ -28,7 +29,6 @@ from dnnmso_mj.trace import Event, RunInfo, StepLayout
 from dnnmso_mj.viewer.process import (
     RerunProcess,
     check_display,
-    check_rerun,
     data_address,
     free_port,
     listens,
@@ -133,7 +133,7 @@ def connected(address: str, backlog: int = BACKLOG_BYTES) -> Iterator[LiveView]:
     Raises:
         MissingExtraError: rerun is not installed.
     """
-    check_rerun()
+    require("viewer", "the viewer")
     memory = shared_memory(backlog)
     control, its_control = Pipe()
     with tempfile.TemporaryFile() as messages, control:
@@ -170,7 +170,7 @@ def window() -> Iterator[LiveView]:
         DnnmsoError: there is no display, or the viewer cannot start.
         MissingExtraError: rerun is not installed.
     """
-    check_rerun()
+    require("viewer", "the viewer")
     check_display("Use --serve (a browser), or run without --view and `dnnmso replay` the log")
     with started("--hide-welcome-screen", "--expect-data-soon") as live:
         yield live
@@ -186,7 +186,7 @@ def served(port: int) -> Iterator[LiveView]:
         DnnmsoError: the port is taken, or the server cannot start.
         MissingExtraError: rerun is not installed.
     """
-    check_rerun()
+    require("viewer", "the viewer")
     with web_server(port) as server:
         server.process.give_way()
         print(f"live     {server.page}", file=sys.stderr, flush=True)

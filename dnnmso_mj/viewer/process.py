@@ -12,7 +12,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from signal import SIGHUP, SIGTERM
 from types import FrameType
@@ -207,18 +206,6 @@ def until_interrupted() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def check_rerun() -> None:
-    """Refuse to go on without Rerun; it is not imported.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
-    if find_spec("rerun") is None:
-        raise MissingExtraError(
-            "the viewer needs rerun, which is not installed: pip install 'dnnmso_mj[viewer]'"
-        )
 
 
 def check_display(instead: str) -> None:

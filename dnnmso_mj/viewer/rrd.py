@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import rerun as rr
 
 from dnnmso_mj.errors import LogError
+from dnnmso_mj.log.segments import Segment
 from dnnmso_mj.reading import Snapshot
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.trace import StepLayout, Trace
@@ -23,12 +24,21 @@ MOST_RUNS = len(RUN_COLORS)
 
 @dataclass(frozen=True)
 class Run:
-    """A run to show, of at least one tick; `name` tells it from others beside it."""
+    """A run to show, of at least one tick.
+
+    Args:
+        name: tells it from others beside it.
+        trace: its columns.
+        scene: its robot.
+        snapshots: of its controller.
+        segments: which scenario was in force when, where that has changed.
+    """
 
     name: str
     trace: Trace
     scene: Scene
     snapshots: Sequence[Snapshot] = ()
+    segments: Sequence[Segment] = ()
 
 
 def rrd_bytes(
@@ -65,12 +75,16 @@ def _stream(recording: rr.RecordingStream, run: Run, prefix: str, look: Look) ->
 
 def _send(stream: RunStream, run: Run) -> None:
     """A whole run that has begun."""
-    stream.send(run.trace)
-    stream.events(run.trace.events)
+    trace = run.trace
+    segments = run.segments or [Segment(0, trace.scenario)]
+    ends = [*(segment.first for segment in segments[1:]), len(trace)]
+    for segment, end in zip(segments, ends, strict=True):
+        columns = {name: trace[name][segment.first : end] for name in trace}
+        stream.send(replace(trace, columns=columns, scenario=segment.scenario))
+    stream.events(trace.events)
     for snapshot in run.snapshots:
-        if snapshot.name == "controller":
-            stream.snapshot(snapshot.t, snapshot.arrays)
-    stream.end(run.trace.info)
+        stream.snapshot(snapshot.t, snapshot.arrays)
+    stream.end(trace.info)
 
 
 def _send_together(

@@ -18,6 +18,7 @@ from dnnmso_mj.scenario import (
     ClassicalMso,
     ConcurrentLearning,
     DnnMso,
+    External,
     Imperfections,
     LewisNn,
     Madam,
@@ -73,8 +74,8 @@ def plot_tabs(scenario: Scenario, scene: Scene, layout: StepLayout) -> dict[str,
 
 
 def learns(scenario: Scenario, layout: StepLayout) -> bool:
-    """Whether a controller's f̂ comes of what it has seen."""
-    adaptive = RbfMso | LewisNn | SlotineLi | ConcurrentLearning
+    """Whether a controller's f̂ comes of what it has seen, as far as is known."""
+    adaptive = RbfMso | LewisNn | SlotineLi | ConcurrentLearning | External
     return layout.n_layers > 0 or isinstance(scenario.controller, adaptive)
 
 
@@ -259,12 +260,13 @@ def _sensors_err(imperfections: Imperfections) -> bool:
         or imperfections.jitter > 0.0
         or imperfections.encoder_counts is not None
         or imperfections.velocity_from != ideal.velocity_from
+        or bool(imperfections.external)
     )
 
 
 def _drives_err(imperfections: Imperfections) -> bool:
     """Whether the torque that acts can be another than the one commanded."""
-    names = ("torque_limit", "torque_rate", "actuator_lag", "actuator_delay")
+    names = ("torque_limit", "torque_rate", "actuator_lag", "actuator_delay", "external")
     return any(bool(getattr(imperfections, name)) for name in names)
 
 

@@ -101,7 +101,8 @@ class RunStream:
         """Send a stretch of ticks: every value of every line, the arm at most every 10 ms.
 
         Args:
-            trace: the columns of the ticks that follow those sent before.
+            trace: the columns of the ticks that follow those sent before, and the scenario that was
+                in force in them.
         """
         if not len(trace):
             return
