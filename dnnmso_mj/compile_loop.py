@@ -15,14 +15,17 @@ import os
 import subprocess
 import sys
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numba.core import event
 
 from dnnmso_mj.compiling import CompileNotice
 from dnnmso_mj.plant import Mjcf
-from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.scenario import Pd, Scenario
 from dnnmso_mj.sources import python_path
+
+if TYPE_CHECKING:
+    from dnnmso_mj.tick import World
 
 
 def compile_elsewhere(run: Any, arguments: tuple[Any, ...], scenario: Scenario, mjcf: Mjcf) -> None:
@@ -35,12 +38,34 @@ def compile_elsewhere(run: Any, arguments: tuple[Any, ...], scenario: Scenario, 
         arguments: what it will be called with.
         scenario, mjcf: what another process makes such arguments of.
     """
-    if is_compiled(run, arguments):
-        return
+    if not is_compiled(run, arguments):
+        _elsewhere(scenario, mjcf)
+
+
+def compile_halves_elsewhere(world: World, scenario: Scenario, mjcf: Mjcf) -> None:
+    """The same of the two halves of a tick, which every controller without a loop of its own has.
+
+    Args:
+        world: what they will be called with.
+        scenario, mjcf: what another process makes such a world of, with any controller.
+    """
+    if not all(is_compiled(*call) for call in _halves(world)):
+        _elsewhere(scenario.model_copy(update={"controller": Pd(kind="pd")}), mjcf, halves=True)
+
+
+def _halves(world: World) -> list[tuple[Any, tuple[Any, ...]]]:
+    from dnnmso_mj.controllers.measured import empty_command
+    from dnnmso_mj.tick import begin_tick, end_tick
+
+    command = empty_command(world.tau.size)
+    return [(begin_tick, (world, 0)), (end_tick, (world, command, 0))]
+
+
+def _elsewhere(scenario: Scenario, mjcf: Mjcf, *, halves: bool = False) -> None:
     with suppress(OSError):
         subprocess.run(
             [sys.executable, "-P", "-m", "dnnmso_mj.compile_loop"],
-            input=json.dumps([_whole(scenario), mjcf.text, mjcf.folder]).encode(),
+            input=json.dumps([_whole(scenario), mjcf.text, mjcf.folder, halves]).encode(),
             env=os.environ | {"PYTHONPATH": python_path()},
             start_new_session=True,  # Ctrl-C is for us, and we end it
             check=False,
@@ -68,11 +93,14 @@ def main() -> None:
     from dnnmso_mj.controllers import compiled_ticks
     from dnnmso_mj.simulation import Simulation
 
-    scenario, text, folder = json.loads(sys.stdin.buffer.read())
+    scenario, text, folder, halves = json.loads(sys.stdin.buffer.read())
     simulation = Simulation(Scenario.model_validate_json(scenario), Mjcf(text, folder))
     ticks = compiled_ticks(simulation.controller)
-    if ticks is not None:
-        with event.install_listener("numba:compile", CompileNotice()):
+    with event.install_listener("numba:compile", CompileNotice()):
+        if halves:
+            for half, arguments in _halves(simulation.world):
+                half.compile(tuple(map(half.typeof_pyval, arguments)))
+        elif ticks is not None:
             ticks.run(simulation.world, ticks.parts, 0, 0)
 
 

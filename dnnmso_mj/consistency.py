@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from dnnmso_mj.scenario.backstepping import Backstepping
 from dnnmso_mj.scenario.controller import effectiveness, inversion
+from dnnmso_mj.scenario.policy import Policy
 from dnnmso_mj.scenario.replay import DnnMsoReplay
 from dnnmso_mj.scenario.rivals import Rival
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from dnnmso_mj.scenario import Scenario
 
 MAX_TICKS = 100_000_000
+MULTIPLE = "multiple of dt = {0} within the duration; allowed: {0}, or several times that"
 STEP_GAINS = ("K_q", "K_v", "K_tau")
 
 Problem = tuple[str, str]
@@ -28,6 +30,7 @@ def contradictions(scenario: Scenario) -> list[Problem]:
         *_times_below_dt(scenario),
         *_observer_gain(scenario),
         *_step_gains(scenario),
+        *_policy_step(scenario),
         *_stalls(scenario),
         *_events(scenario),
         *_sizes(scenario),
@@ -82,6 +85,18 @@ def _step_gains(scenario: Scenario) -> Iterator[Problem]:
         if max(getattr(controller, name)) >= most:
             problem = f"makes a sampled error unstable; allowed: {name} < 2/dt = {most:g}"
             yield f"controller.{name}", problem
+
+
+def _policy_step(scenario: Scenario) -> Iterator[Problem]:
+    held = getattr(scenario.controller, "control_timestep", None)
+    if held is not None and not is_multiple(held, scenario):
+        yield "controller.control_timestep", f"is no {MULTIPLE.format(scenario.dt)}"
+
+
+def is_multiple(time: float, scenario: Scenario) -> bool:
+    """Whether a time is a whole number of steps within the scenario."""
+    steps = time / scenario.dt
+    return 0.5 < steps < scenario.n_ticks + 0.5 and abs(steps - round(steps)) <= 1e-6
 
 
 def _stalls(scenario: Scenario) -> Iterator[Problem]:
@@ -151,7 +166,7 @@ def _controller_vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, 
                 yield f"{path}.effectiveness.{name}", len(values), {n}
     for path, K2 in _observer_gains(scenario):
         yield path, len(K2), {1, 2 * n}
-    if isinstance(controller, Rival | Backstepping):  # each of their gains is of a joint
+    if isinstance(controller, Rival | Backstepping | Policy):  # their lists are of joints
         yield from _numbers("controller", controller, n)
     for name, allowed in (("K_v", {1, n}), ("box", {1, 2 * n})):
         if hasattr(controller, name):

@@ -213,7 +213,7 @@ class Plant:
     Attributes:
         q, qd: joint angle (n,) rad and velocity (n,) rad/s: live, read-only views.
         applied: torque (n,) N·m on the joints beside the motors': live, held until changed.
-        model: MuJoCo's model, this plant's own.
+        model, data: MuJoCo's, this plant's own.
         view: the same robot for compiled code.
     """
 
@@ -224,7 +224,7 @@ class Plant:
                 f"initial.q has {scenario.n_joints} entries; allowed: {self.model.nv}, "
                 f"since plant.model = {scenario.plant.model} has {self.model.nv} joints"
             )
-        data = self._data = mujoco.MjData(self.model)
+        data = self.data = mujoco.MjData(self.model)
         self.q: Array = _read_only(data.qpos)
         self.qd: Array = _read_only(data.qvel)
         self.applied: Array = data.qfrc_applied
@@ -240,20 +240,20 @@ class Plant:
 
     def reset(self, q: Array, qd: Array) -> None:
         """Put the robot at q (n,) rad, q̇ (n,) rad/s, at time zero."""
-        mujoco.mj_resetData(self.model, self._data)
-        self._data.qpos[:] = q
-        self._data.qvel[:] = qd
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = q
+        self.data.qvel[:] = qd
 
     def state(self) -> Array:
         """Everything that the next step depends on; time, q and q̇ come first."""
         state = np.empty(mujoco.mj_stateSize(self.model, WHOLE))
-        mujoco.mj_getState(self.model, self._data, state, WHOLE)
+        mujoco.mj_getState(self.model, self.data, state, WHOLE)
         return state
 
     def restore(self, state: Array) -> None:
         """Go on from a `state`; of that of a plant with other parts, only q and q̇ are taken."""
         if state.size == mujoco.mj_stateSize(self.model, WHOLE):
-            mujoco.mj_setState(self.model, self._data, state, WHOLE)
+            mujoco.mj_setState(self.model, self.data, state, WHOLE)
         else:
             n = self.q.size
             self.reset(state[1 : 1 + n], state[1 + n : 1 + 2 * n])

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numba.core import event
 
-from dnnmso_mj.compile_loop import compile_elsewhere
+from dnnmso_mj.compile_loop import compile_elsewhere, compile_halves_elsewhere
 from dnnmso_mj.compiling import CompileNotice
 from dnnmso_mj.controllers import (
     LEARNING,
@@ -190,6 +190,8 @@ class Simulation:
 
     def _prepare(self) -> None:
         """Load or compile what ticks need, so that none of them pays for it."""
+        if self._ticks is None and self._mjcf is not None:
+            compile_halves_elsewhere(self.world, self.scenario, self._mjcf)
         with event.install_listener("numba:compile", CompileNotice()):
             if self._ticks is not None:
                 arguments = (self.world, self._ticks.parts, 0, 0)

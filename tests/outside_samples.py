@@ -124,9 +124,9 @@ def ends(t):
     return tuple(part / (t < 0.4)[:, None] for part in swing(t))
 
 
-def ramp(t):
-    moving = (t > 0.1) & (t < 0.2)
-    q = np.clip(t - 0.1, 0.0, 0.1)[:, None] * [1.0, 1.0]
+def ramp(t, at):
+    moving = (t > at) & (t < at + 0.1)
+    q = np.clip(t - at, 0.0, 0.1)[:, None] * [1.0, 1.0]
     return q, moving[:, None] * [1.0, 1.0], 0.0 * q
 
 

@@ -29,8 +29,14 @@ def commands(page: Path, program: str) -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory) -> Path:
-    """A folder with the logs that the pages speak of."""
+    """A folder with the logs that the pages speak of, and the files that they have one write."""
     folder = tmp_path_factory.mktemp("workplace")
+    titled = re.compile(
+        r'^```(?:yaml|python) title="([\w.]+)"\n(.*?)^```', re.MULTILINE | re.DOTALL
+    )
+    for page in PAGES:
+        for name, content in titled.findall(page.read_text(encoding="utf-8")):
+            (folder / name).write_text(content, encoding="utf-8")
     for name in ("paper", "paper_no_network"):
         short = [BIN / "dnnmso", "run", name, "--set", "duration=0.2", "--no-plot"]
         subprocess.run(short, cwd=folder, check=True, capture_output=True, timeout=120)

@@ -22,6 +22,7 @@ from dnnmso_mj.comparison.plan import plan_comparison
 from dnnmso_mj.controllers import Inputs, build_controller
 from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import ExternalError, ScenarioError
+from dnnmso_mj.external.reference import CHECKED, STEP
 from dnnmso_mj.loading import controller_kinds, load_scenario, require_trust, scenario_schema
 from dnnmso_mj.log.format import snapshot_arrays, snapshot_data
 from dnnmso_mj.memory_recorder import MemoryRecorder
@@ -342,7 +343,9 @@ def test_what_is_no_reference_is_refused(name, settings, words, laws):
 
 
 def test_a_corner_is_no_wrong_derivative(laws):
-    assert simulate(follow("laws.py:ramp")).info.status == "ok"
+    looked_at = 0.3 * 100.618 / CHECKED
+    for beside in (-0.5 * STEP, 0.5 * STEP):
+        assert simulate(follow("laws.py:ramp", at=looked_at + beside)).info.status == "ok"
 
 
 # --- imperfections ----------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from dnnmso_mj.scenario import (
     External,
     LewisNn,
     NoNetwork,
+    Policy,
     RbfMso,
     Scenario,
     SlotineLi,
@@ -162,9 +163,11 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
     from dnnmso_mj.controllers.dnn_mso_replay import DnnMsoReplayController
     from dnnmso_mj.controllers.lewis_nn import LewisNnController
     from dnnmso_mj.controllers.no_network import NoNetworkController
+    from dnnmso_mj.controllers.policy import PolicyController
     from dnnmso_mj.controllers.rbf_mso import RbfMsoController
     from dnnmso_mj.controllers.rivals import build_rival
     from dnnmso_mj.controllers.slotine_li import SlotineLiController
+    from dnnmso_mj.observation import torque_scale
 
     nominal = NominalModel(scenario, mjcf)
     n, dt, seed = scenario.n_joints, scenario.dt, scenario.seed
@@ -185,5 +188,6 @@ def build_controller(scenario: Scenario, mjcf: Mjcf, *, watch: bool = True) -> C
         SlotineLi: lambda: SlotineLiController(spec, dt, nominal),
         ConcurrentLearning: lambda: ConcurrentLearningController(spec, dt, nominal),
         NoNetwork: lambda: NoNetworkController(spec, n, dt, nominal),
+        Policy: lambda: PolicyController(spec, torque_scale(scenario, spec.torque_scale), dt),
     }
     return builders[type(spec)]()

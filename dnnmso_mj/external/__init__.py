@@ -19,7 +19,7 @@ from dnnmso_mj.errors import DnnmsoError, ExternalError, ScenarioError
 from dnnmso_mj.importing import import_named
 from dnnmso_mj.plant import Mjcf, NominalModel
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.wording import show
+from dnnmso_mj.wording import clean, show
 
 # What a scenario's seed is joined by; the sensors' own streams have keys of one number.
 CONTROLLER_STREAM, IMPERFECTION_STREAM = 1000, 1001
@@ -109,4 +109,4 @@ def told(error: Exception) -> str:
     """An exception with the place that raised it."""
     frames = traceback.extract_tb(error.__traceback__)[1:]  # the first is the caller's
     place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
-    return f"{type(error).__name__}: {error}{place}"
+    return f"{type(error).__name__}: {clean(' '.join(str(error).split()))}{place}"

@@ -87,10 +87,12 @@ class Hooks:
         }
 
     def restore(self, state: Mapping[str, Array]) -> None:
-        """Put a `state` back."""
+        """Put a `state` back; one that is not in it stays as it is."""
         for k, kept in enumerate(self._kept):
-            mine = f"{k}."
-            kept.restore({n.removeprefix(mine): v for n, v in state.items() if n.startswith(mine)})
+            prefix = f"{k}."
+            own = {n.removeprefix(prefix): v for n, v in state.items() if n.startswith(prefix)}
+            if own:
+                kept.restore(own)
 
     def _add(self, found: Any, setup: Setup, key: str, python: str) -> None:
         name = type(found).__name__

@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from dnnmso_mj.loading.advice import advice
 from dnnmso_mj.loading.complaints import Complaint, complain, explain
 from dnnmso_mj.loading.documents import Node, Problem, read_document
 from dnnmso_mj.loading.overrides import Override, apply_overrides, parse_overrides
+from dnnmso_mj.loading.pinning import pin_policy
 from dnnmso_mj.loading.places import Places
 from dnnmso_mj.loading.shape import Shape, lookup, scenario_schema
 from dnnmso_mj.loading.text import read_text
@@ -32,6 +34,7 @@ from dnnmso_mj.paths import (
     shipped_controllers,
 )
 from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.scenario.tuned import TunedController
 from dnnmso_mj.wording import did_you_mean, show
 
 __all__ = [
@@ -89,6 +92,7 @@ def load_scenario(
     complaints += _resolve_model(data, draft.file, places.sets)
     if not trust:
         complaints += [complain(path, data, PROBLEM) for path, _ in import_paths(data)]
+    pin_policy(data)
     scenario = None
     try:
         scenario = Scenario.model_validate(data)
@@ -134,11 +138,19 @@ def kind_set(kind: str) -> str:
     return f"controller={{kind: {kind}}}"
 
 
+@cache
 def controller_kinds() -> tuple[str, ...]:
-    """Every kind of controller that its defaults alone make one."""
+    """Every kind of controller that its defaults alone make whole; a policy needs a file, say."""
     controller = Shape.root().child("controller")
-    kinds = controller.kinds if controller else {}
-    return tuple(kind for kind, shape in kinds.items() if shape.required <= {"kind"})
+    return tuple(filter(_stands_alone, controller.choices)) if controller else ()
+
+
+def _stands_alone(kind: str) -> bool:
+    try:
+        TunedController.model_validate({"controller": {"kind": kind}})
+    except ValidationError:
+        return False
+    return True
 
 
 def located(

@@ -99,11 +99,6 @@ class Shape:
         return tuple(self._target.get("properties", ()))
 
     @property
-    def required(self) -> frozenset[str]:
-        """The keys of a part that have no default."""
-        return frozenset(self._target.get("required", ()))
-
-    @property
     def choices(self) -> tuple[str, ...]:
         """The words that are allowed here, if it is a choice of words."""
         if self.kinds:

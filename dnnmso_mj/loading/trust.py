@@ -15,7 +15,8 @@ from dnnmso_mj.importing import is_import_path
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.wording import KeyPath, dotted, show
 
-PYTHON = "python"  # every key of this name holds what is imported, wherever it stands
+PYTHON = "python"  # every key of this name holds what is imported, wherever it stands,
+FILE = "file"  # and one of this name a file
 
 PROBLEM = (
     "runs code of its own; allowed: --trust (trust=True), if you know the scenario and that code"
@@ -23,7 +24,7 @@ PROBLEM = (
 
 
 def anchored(data: Any, folder: Path) -> Any:
-    """A copy of some data in which every file that a key `python` names is absolute.
+    """A copy of some data in which every file that a key `python` or `file` names is absolute.
 
     Args:
         data: nested dicts, lists and values.
@@ -31,14 +32,16 @@ def anchored(data: Any, folder: Path) -> Any:
     """
     if isinstance(data, dict):
         return {
-            key: absolute(value, folder) if key == PYTHON else anchored(value, folder)
+            key: absolute(value, folder, key) if key in {PYTHON, FILE} else anchored(value, folder)
             for key, value in data.items()
         }
     return [anchored(item, folder) for item in data] if isinstance(data, list) else data
 
 
-def absolute(name: Any, folder: Path) -> Any:
-    """ "file.py:Name" with the file's absolute path; anything else as it is."""
+def absolute(name: Any, folder: Path, key: str = PYTHON) -> Any:
+    """ "file.py:Name", or what `file` holds, with its absolute path; anything else as it is."""
+    if key == FILE:
+        return str(folder.absolute() / name) if name and isinstance(name, str) else name
     where, colon, attribute = name.rpartition(":") if isinstance(name, str) else ("", "", "")
     if not colon or not where.endswith(".py"):
         return name

@@ -38,6 +38,7 @@ from dnnmso_mj.scenario.inversion import Inversion
 from dnnmso_mj.scenario.learning import Network, Observer
 from dnnmso_mj.scenario.neural import LewisNn
 from dnnmso_mj.scenario.optimizers import Adam, ByMadam, Madam, Rule, Sgd, SignSgd
+from dnnmso_mj.scenario.policy import Policy
 from dnnmso_mj.scenario.replay import DnnMsoReplay, KnownDelay
 from dnnmso_mj.scenario.rivals import L1, Adrc, ComputedTorque, Pd, Pid, Rise, SlidingMode
 
@@ -77,6 +78,7 @@ __all__ = [
     "Pd",
     "Pid",
     "Plant",
+    "Policy",
     "Push",
     "RbfMso",
     "RealTime",

@@ -15,6 +15,7 @@ from dnnmso_mj.scenario.inversion import Inversion
 from dnnmso_mj.scenario.learning import Network, Observer
 from dnnmso_mj.scenario.neural import LewisNn
 from dnnmso_mj.scenario.optimizers import ByMadam, Madam, Optimizer, Rule, check_resolvable, chosen
+from dnnmso_mj.scenario.policy import Policy
 from dnnmso_mj.scenario.replay import DnnMsoReplay
 from dnnmso_mj.scenario.rivals import Rival
 
@@ -132,6 +133,7 @@ Controller = Annotated[
     | Backstepping
     | SlotineLi
     | ConcurrentLearning
+    | Policy
     | Rival
     | External,
     Field(discriminator="kind"),

@@ -1,0 +1,277 @@
+"""A scenario that torques from outside drive, tick by tick, by the very code of `simulate`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from dnnmso_mj.compile_loop import compile_halves_elsewhere
+from dnnmso_mj.consistency import MULTIPLE, is_multiple
+from dnnmso_mj.controllers import Command, Inputs
+from dnnmso_mj.controllers.measured import empty_command, show_measured
+from dnnmso_mj.errors import DnnmsoError, NonFiniteError, ScenarioError
+from dnnmso_mj.external.imperfection import Hooks
+from dnnmso_mj.imperfections.sensors import SensorBank
+from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.memory_recorder import LARGEST_BLOCK, MemoryRecorder
+from dnnmso_mj.metrics import Metrics, compute_metrics
+from dnnmso_mj.observation import PARTS, observe, torque, torque_scale
+from dnnmso_mj.paths import find_model
+from dnnmso_mj.plant import Mjcf
+from dnnmso_mj.reference import Reference
+from dnnmso_mj.scenario import Policy, Scenario
+from dnnmso_mj.simulation import Simulation
+from dnnmso_mj.tick import ROWS, RUNNING, STATUS, begin_tick, end_tick
+from dnnmso_mj.trace import Event, RunInfo, Trace
+from dnnmso_mj.world import CHUNK
+
+Array = np.ndarray
+
+PRECISION = 0.1  # rad: an error of this size halves the reward
+EFFORT = 0.05  # share of the reward that full torque on all joints costs
+
+
+def outside() -> None:
+    """What drives an episode, as its scenario names it: nothing that could be run again.
+
+    Raises:
+        DnnmsoError: always.
+    """
+    raise DnnmsoError("the torques of this run came from outside, and its scenario has them not")
+
+
+class FromOutside:
+    """The controller of an episode: it commands what it is given."""
+
+    n_layers = 0
+
+    def __init__(self, n_joints: int) -> None:
+        self.command = empty_command(n_joints)
+
+    def reset(self, x: Array) -> None:
+        """It has no memory."""
+
+    def update(self, inputs: Inputs) -> Command:
+        show_measured(self.command, inputs.x)
+        return self.command
+
+    def dynamics(self, x: Array) -> Array:
+        return np.zeros(x.size // 2)
+
+    def state(self) -> dict[str, Array]:
+        return {}
+
+    def restore(self, state: Mapping[str, Array]) -> None:
+        """It has no memory."""
+
+
+class Episode(Simulation):
+    """A scenario driven from outside; call `restart` first.
+
+    Args:
+        scenario: the experiment, or what `load_scenario` takes; its controller has no part in it.
+        sets: "a.b=c", where `scenario` is to be loaded.
+        scale: torque of an action of 1 (N·m), one number or one a joint; None: the torque limit,
+            or 128 without one.
+
+    Attributes:
+        scale: the same, (n,).
+        over: whether the end was reached.
+        error: why it was reached before its time; "" otherwise.
+
+    Raises:
+        ScenarioError: as `load_scenario` and `Simulation`.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario | str | Path,
+        sets: tuple[str, ...] = (),
+        scale: float | tuple[float, ...] | None = None,
+    ) -> None:
+        if not isinstance(scenario, Scenario):
+            scenario = load_scenario(scenario, sets)
+        elif sets:
+            raise ScenarioError(f"sets = {list(sets)}; allowed: none beside a loaded scenario")
+        each = None if scale is None else _positive(scale, scenario.n_joints)
+        scenario = _driven_from_outside(scenario, each)
+        self.scale = torque_scale(scenario, each)
+        self._outside = FromOutside(scenario.n_joints)
+        self._model = Mjcf.read(find_model(scenario.plant.model))
+        super().__init__(scenario, self._model, controller=self._outside)
+        compile_halves_elsewhere(self.world, scenario, self._model)
+        self.over, self.error = True, ""
+
+    @property
+    def t(self) -> float:
+        """Time of the next tick (s)."""
+        return self._tick * self.scenario.dt
+
+    def restart(self, scenario: Scenario) -> None:
+        """Go to the start.
+
+        Args:
+            scenario: the episode's own, which differs from the first in seed, initial state and
+                reference alone: see `start.episode_scenario`.
+        """
+        self.scenario, n = scenario, scenario.n_joints
+        self.reference = Reference(scenario.reference, n, scenario.duration)
+        if self.hooks:
+            self.hooks = Hooks(scenario, self._model)
+        sensors = SensorBank(scenario.imperfections, n, scenario.dt, scenario.seed, CHUNK)
+        perfect = sensors.view.perfect and not self.hooks
+        self.world = self.world._replace(sensors=sensors.view._replace(perfect=perfect))
+        self._sensors = sensors
+        self._recorder = MemoryRecorder(self.layout, scenario.n_ticks)
+        self.over, self.error = False, ""
+        self._began, self._tick = time.perf_counter(), 0
+        self._start()
+        self._open_block()
+        self._tell()
+
+    def observation(self) -> Array:
+        """What is told of the present tick: a new vector (6n,); see `observation`."""
+        out = np.empty(len(PARTS) * self.scenario.n_joints)
+        observe(self.world.inputs, out)
+        return out
+
+    def torque(self, action: Array) -> Array:
+        """The torque (n,) N·m of an action (n,)."""
+        tau = np.empty(self.scenario.n_joints)
+        torque(np.asarray(action, dtype=float), self.scale, tau)
+        return tau
+
+    def hold(self, tau: Array, ticks: int) -> float:
+        """Hold a torque (n,) N·m for some ticks, or until the end.
+
+        Returns:
+            The mean of these ticks' rewards: see `reward`.
+
+        Raises:
+            DnnmsoError: the episode is over.
+        """
+        if self.over:
+            raise DnnmsoError("the episode is over; restart it")
+        total, done = 0.0, 0
+        while done < ticks and not self.over:
+            self._advance(tau)
+            total += self.reward()
+            done += 1
+        return total / done
+
+    def reward(self) -> float:
+        """1/(1 + (‖e‖/ε)²) · (1 − w ‖τ/scale‖²/n) of the true e = q − q_ref now; in [0, 1].
+
+        ε = 0.1 rad, w = 0.05; τ is what was asked for in the tick before. After a divergence 0.
+        N.B. it is never negative, so that no policy gains by ending an episode early.
+        """
+        if self.error:
+            return 0.0
+        n = self.scenario.n_joints
+        e, share = self.world.e_track[:n], self._outside.command.tau / self.scale
+        near = 1.0 / (1.0 + float(e @ e) / PRECISION**2)
+        return near * max(0.0, 1.0 - EFFORT * float(share @ share) / n)
+
+    def place(self) -> None:
+        """Put bodies and cameras where the present angles have them, for who looks at them."""
+        mujoco.mj_fwdPosition(self.plant.model, self.plant.data)
+
+    def trace(self) -> Trace:
+        """The episode so far, as `simulate` returns a run."""
+        if not self.over:
+            self._close_block()
+            self._open_block()
+        status = "diverged" if self.error else "ok" if self.over else "unfinished"
+        wall = time.perf_counter() - self._began
+        info = RunInfo(status, self.scenario.seed, wall, reason=self.error)
+        return self._recorder.trace(self.scenario, info)
+
+    def metrics(self) -> Metrics:
+        """What any run is judged by: see `compute_metrics`."""
+        return compute_metrics(self.trace())
+
+    def _advance(self, tau: Array) -> None:
+        """One tick from its command on, and the next one up to what is told of it."""
+        self._command = self._outside.update(self.world.inputs)
+        self._command.tau[:] = tau
+        try:
+            if self._end():
+                self._close_block()
+                self._end_early(self._why_it_ended())
+                return
+            self._tick += 1
+            self.over = self._tick == self.scenario.n_ticks
+            if self._tick == self._block_end:
+                self._close_block()
+                self._open_block()
+            self._tell()
+        except NonFiniteError as error:  # of an imperfection from outside
+            self._close_block()
+            self._end_early(error)
+
+    def _end(self) -> bool:
+        if self.hooks:
+            return self._end_hooked(self._tick)
+        return bool(end_tick(self.world, self._command, self._tick))
+
+    def _tell(self) -> None:
+        """What the sensors and the reference say of the present tick."""
+        begin_tick(self.world, self._tick)
+        self.hooks.sense(self.t, self.world.inputs.x)
+
+    def _open_block(self) -> None:
+        """Rows are kept block by block, as `Simulation.run` does; what is due now happens."""
+        first = self._tick
+        if first % CHUNK == 0 and first > 0:
+            self._begin_chunk(first)
+        happens = self._happen(first, self._recorder)
+        ends = [first + LARGEST_BLOCK, (first // CHUNK + 1) * CHUNK]
+        self._block_end = min([*ends, *([] if self.over else [happens])])
+        self._first = first
+        self.world.counts[ROWS], self.world.counts[STATUS] = 0, RUNNING
+
+    def _close_block(self) -> None:
+        rows = self.world.rows[: self.world.counts[ROWS]]
+        self._tick = self._first + len(rows)
+        if len(rows):
+            self._recorder.append(rows)
+            self._tell_changes(rows, self._recorder)
+
+    def _end_early(self, error: NonFiniteError) -> None:
+        t = self._tick * self.scenario.dt
+        self.over, self.error = True, f"{error} at t = {t:.6g} s"
+        self._recorder.event(Event(t, "error", f"diverged: {self.error}"))
+
+
+def _driven_from_outside(scenario: Scenario, scale: tuple[float, ...] | None) -> Scenario:
+    """The scenario with `outside` for its controller, so that nothing of its own one is left."""
+    name = f"{outside.__module__}:{outside.__qualname__}"
+    driver = Policy(kind="policy", python=name, torque_scale=scale)
+    return scenario.model_copy(update={"controller": driver})
+
+
+def _positive(scale: float | tuple[float, ...], n_joints: int) -> tuple[float, ...]:
+    values = np.ravel(np.array(scale, dtype=float))
+    if values.size not in {1, n_joints} or not (np.isfinite(values) & (values > 0.0)).all():
+        raise ScenarioError(
+            f"torque_scale = {scale}; allowed: a number > 0 (N·m), or {n_joints}, one a joint"
+        )
+    return tuple(values.tolist())
+
+
+def ticks_of(control_timestep: float | None, scenario: Scenario) -> int:
+    """How many ticks an action is held.
+
+    Raises:
+        ScenarioError: a time that is no whole number of steps.
+    """
+    if control_timestep is None:
+        return 1
+    if not is_multiple(control_timestep, scenario):
+        problem = f"is no {MULTIPLE.format(scenario.dt)}"
+        raise ScenarioError(f"control_timestep = {control_timestep}: {problem}")
+    return round(control_timestep / scenario.dt)
