@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from outside_samples import LAWS
+from policy_samples import SOURCE
 from resume_samples import SCENARIOS
 
 from dnnmso_mj.branching import _refill
@@ -307,6 +308,19 @@ def test_code_from_outside_goes_on_too_if_it_is_trusted(tmp_path):
     assert resume(log, 0.3, [other], trust=True).told == ""
     gone = resume(log, 0.3, ["imperfections.external=[]"], trust=True).run.trace
     assert np.array_equal(gone["q_meas"][300:], gone["q"][300:])
+
+
+def test_a_policy_goes_on_from_what_it_remembers(tmp_path):
+    (tmp_path / "policies.py").write_text(SOURCE)
+    sets = [
+        f"controller={{kind: policy, python: '{tmp_path}/policies.py:Counter'}}",
+        "duration=0.2",
+    ]
+    log = run_logged(load_scenario("paper", sets, trust=True), tmp_path / "run.mcap").log
+    again = resume(log, 0.12, out=tmp_path / "again.mcap", trust=True).run.log
+    assert difference(log, again).equal
+    faster = resume(log, 0.12, ["controller.torque_scale=9"], trust=True)
+    assert faster.told.endswith("the controller goes on as it is")
 
 
 def test_a_torn_log_is_run_to_its_end(pd):
