@@ -13,6 +13,7 @@ import numpy as np
 
 from dnnmso_mj.assets import read_assets
 from dnnmso_mj.errors import LogError, RunInterrupted
+from dnnmso_mj.interrupts import interrupted_once
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.paths import find_model, logs_dir
 from dnnmso_mj.plant import Mjcf
@@ -58,7 +59,8 @@ def run_logged(
     Raises:
         ScenarioError: the model cannot be used; no log is left behind.
         LogError: the log exists or cannot be written.
-        RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run.
+        RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run. Another Ctrl-C
+            while the log is being ended does nothing.
     """
     mjcf = Mjcf.read(find_model(scenario.plant.model))
     pace = real_time_pace(scenario) if real_time else AS_FAST_AS_CAN_BE
@@ -86,17 +88,21 @@ def run_to_end(
         layout: of the log's rows.
 
     Raises:
-        RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run.
+        RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run. Another Ctrl-C
+            while the log is being ended does nothing.
     """
-    started = time.perf_counter()
-    try:
-        info = run()
-    except KeyboardInterrupt as stop:
-        wall = time.perf_counter() - started
-        info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
-        trace = _finish(recorder, scenario, layout, info)
-        raise RunInterrupted(recorder.path, len(trace)) from stop
-    return LoggedRun(_finish(recorder, scenario, layout, info), recorder.path)
+    with interrupted_once() as end:
+        started = time.perf_counter()
+        try:
+            info = run()
+        except KeyboardInterrupt as stop:
+            end()
+            wall = time.perf_counter() - started
+            info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
+            trace = _finish(recorder, scenario, layout, info)
+            raise RunInterrupted(recorder.path, len(trace), trace) from stop
+        end()
+        return LoggedRun(_finish(recorder, scenario, layout, info), recorder.path)
 
 
 def _finish(recorder: McapRecorder, scenario: Scenario, layout: StepLayout, info: RunInfo) -> Trace:

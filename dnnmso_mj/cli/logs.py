@@ -8,14 +8,16 @@ from typing import Annotated
 
 import typer
 
-from dnnmso_mj.cli.shared import Json, Log, listing, number, print_table, working
+from dnnmso_mj.cli.shared import Json, Log, Logs, listing, number, print_table, working
+from dnnmso_mj.extras import require
 
 
 def plot(
-    logs: Annotated[list[Path], typer.Argument(help="One log, or several to compare.")],
+    logs: Logs,
     out: Annotated[Path | None, typer.Option(help="Folder; default beside the first log.")] = None,
 ) -> None:
-    """Draw the paper's figures and the theory from logs."""
+    """Draw the paper's figures and the theory from logs; several are compared."""
+    require("plot", "dnnmso plot")
     from dnnmso_mj.plots import save_comparison, save_figures
     from dnnmso_mj.reading import read_trace
 
@@ -44,6 +46,7 @@ def replay(
     tab: Annotated[str, typer.Option(help="Open tab of --save and --screenshot.")] = "Tracking",
 ) -> None:
     """Open a log in the Rerun viewer."""
+    require("viewer", "dnnmso replay")
     from dnnmso_mj import replay as viewer
 
     if save is not None:
