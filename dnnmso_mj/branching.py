@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dnnmso_mj.scenario import External, Scenario
+from dnnmso_mj.scenario import External, Policy, Scenario
 from dnnmso_mj.scenario.controller import inversion
 from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.theory import UNDEFINED, TrackingBounds, start_bounds
@@ -64,12 +64,22 @@ def misfit(found: Mapping[str, Array] | None, expected: Mapping[str, Array] | No
     return ""
 
 
+def code_of(scenario: Scenario) -> str:
+    """What a controller from outside is made of, which may keep what it likes; else ""."""
+    match scenario.controller:
+        case External(python=python):
+            return python
+        case Policy(python=python, sha256=sha256):
+            return python or sha256 or ""
+    return ""
+
+
 def _why_anew(state: State, fresh: State, before: Scenario, now: Scenario) -> str:
     kinds = before.controller.kind, now.controller.kind
     if kinds[0] != kinds[1]:
         return f"it was {kinds[0]}, and is {kinds[1]}"
-    if isinstance(before.controller, External) and isinstance(now.controller, External):
-        codes = before.controller.python, now.controller.python
+    codes = code_of(before), code_of(now)
+    if codes[0]:
         return "" if codes[0] == codes[1] else f"it was {codes[0]}, and is {codes[1]}"
     return misfit(state.controller, fresh.controller)
 

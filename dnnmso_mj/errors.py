@@ -1,6 +1,12 @@
 """The errors that reach a person: each names the culprit, its value and what is allowed."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dnnmso_mj.trace import Trace
 
 
 class DnnmsoError(Exception):
@@ -24,12 +30,13 @@ class ExternalError(DnnmsoError):
 
 
 class RunInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a logged run; the log is whole and holds the run's first `ticks`."""
+    """Ctrl-C during a logged run; the log is whole and holds the run's first `ticks`: `trace`."""
 
-    def __init__(self, log: Path, ticks: int) -> None:
+    def __init__(self, log: Path, ticks: int, trace: Trace | None = None) -> None:
         super().__init__(f"log: {log} ({ticks} ticks)")
         self.log = log
         self.ticks = ticks
+        self.trace = trace
 
 
 class NonFiniteError(DnnmsoError):

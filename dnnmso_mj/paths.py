@@ -6,11 +6,14 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 
-from dnnmso_mj.errors import DnnmsoError, ScenarioError
+from dnnmso_mj.errors import DnnmsoError, LogError, ScenarioError
 from dnnmso_mj.wording import clean, did_you_mean, show
 
 PACKAGE = Path(__file__).resolve().parent
 LITERATURE = "literature"
+LOGS = "logs"
+LAST = "last"  # the log that was written last
+LISTED = 8
 MODELS = "dnnmso_mj.models"  # entry points
 
 
@@ -36,7 +39,39 @@ def shipped_controllers() -> list[str]:
 
 def logs_dir() -> Path:
     """Where logs go unless told otherwise: `logs` under the current directory."""
-    return Path.cwd() / "logs"
+    return Path.cwd() / LOGS
+
+
+def log_names() -> list[str]:
+    """Names of the logs in that folder, the newest first."""
+    logs = ((path.stat().st_mtime_ns, path.stem) for path in Path(LOGS).glob("*.mcap"))
+    return [name for _, name in sorted(logs, reverse=True)]
+
+
+def find_log(source: str | Path) -> Path:
+    """Find a log by path, or by a short name.
+
+    Args:
+        source: a file; else NAME for logs/NAME.mcap; else "last" for the newest log there.
+
+    Raises:
+        LogError: none of them; lists the newest logs.
+    """
+    path, name = Path(source), str(source).removesuffix(".mcap")
+    names = [] if _is_file(path) else log_names()
+    if name in names or (name == LAST and names):
+        return Path(LOGS) / f"{name if name in names else names[0]}.mcap"
+    if _exists(path):
+        return path
+    shown = clean(str(source)) or "(no name)"
+    if not names:
+        raise LogError(
+            f"{shown}: no such log, and none in {LOGS}; allowed: a log file (.mcap), or, once "
+            "`dnnmso run paper` has made one, its name: paper"
+        )
+    newest = ", ".join([*names[:LISTED], *(["…"] if len(names) > LISTED else [])])
+    ways = f"a log file (.mcap), {LAST}, or one of {LOGS}, the newest first: {newest}"
+    raise LogError(f"{shown}: no such log; allowed: {ways}{did_you_mean(Path(name).stem, names)}")
 
 
 def scenario_names() -> list[str]:

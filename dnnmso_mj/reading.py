@@ -15,6 +15,7 @@ from dnnmso_mj.log.prefix import Prefix, copy
 from dnnmso_mj.log.scan import Steps, scan
 from dnnmso_mj.log.segments import RESUMED
 from dnnmso_mj.log.writer import LogWriter
+from dnnmso_mj.paths import find_log
 from dnnmso_mj.trace import Event, Trace
 
 Array = np.ndarray
@@ -55,11 +56,14 @@ class Snapshot:
 def read_trace(path: str | Path) -> Trace:
     """The columns of a log. A torn log gives its readable prefix and the status "unfinished".
 
+    Args:
+        path: a log, or the name of one in the folder `logs`; see `dnnmso_mj.paths.find_log`.
+
     Raises:
         LogError: the file is no log of this package, or holds not one tick.
     """
     steps = Steps()
-    log = scan(Path(path), steps.add)
+    log = scan(find_log(path), steps.add)
     columns = steps.columns()
     if columns is None:
         raise log.error("holds no tick: the run ended before its first. Run it again")
@@ -72,7 +76,7 @@ def log_info(path: str | Path) -> LogInfo:
     Raises:
         LogError: the file is no log of this package.
     """
-    log = scan(Path(path))
+    log = scan(find_log(path))
     scenario, run = log.scenario(), log.run()
     return LogInfo(
         path=log.path,
@@ -102,7 +106,7 @@ def read_snapshots(path: str | Path) -> list[Snapshot]:
         LogError: the file is no MCAP, or a snapshot in it is damaged.
     """
     snapshots = []
-    for record in Prefix(Path(path)):
+    for record in Prefix(find_log(path)):
         if not isinstance(record, Attachment) or not (place := snapshot_place(record.name)):
             continue
         try:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dnnmso_mj.branching import misfit
+from dnnmso_mj.branching import code_of, misfit
 from dnnmso_mj.difference import CLOCKED, rows_differ
 from dnnmso_mj.errors import LogError
 from dnnmso_mj.log.segments import Segment
@@ -15,7 +15,6 @@ from dnnmso_mj.memory_recorder import LARGEST_BLOCK
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.provenance import git_commit, software_versions
 from dnnmso_mj.recorded import Recorded
-from dnnmso_mj.scenario import External
 from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.trace import Event, StepLayout
 from dnnmso_mj.world_state import EXTERNAL, State
@@ -96,7 +95,7 @@ def _snapshot(source: Recorded, simulation: Simulation, tick: int) -> State:
     ours = [
         {n: v for n, v in w.items() if not n.startswith(EXTERNAL)} for w in (world, fresh.world)
     ]
-    own = not isinstance(simulation.scenario.controller, External)
+    own = not code_of(simulation.scenario)
     wrong = (own and misfit(controller, fresh.controller)) or misfit(*ours)
     if wrong:
         t = tick * simulation.scenario.dt

@@ -1,125 +1,124 @@
-"""A log in the Rerun viewer: as a file, in a window, in a browser, or as a picture."""
+"""Logs in the Rerun viewer: as a file, in a window, in a browser, or as a picture.
+
+Every function takes one log, or a sequence of up to eight to compare in one viewer.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import sys
 import tempfile
-import urllib.parse
-import urllib.request
-from collections.abc import Iterator
-from http import HTTPStatus
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from signal import SIGHUP, SIGTERM
-from types import FrameType
 
-from mcap.records import Attachment
-
-from dnnmso_mj.errors import DnnmsoError, LogError, MissingExtraError, ScenarioError
+from dnnmso_mj.assets import put_back
+from dnnmso_mj.errors import DnnmsoError, LogError, ScenarioError
+from dnnmso_mj.extras import require
 from dnnmso_mj.log.format import MODEL, unwritable
-from dnnmso_mj.log.prefix import Prefix
-from dnnmso_mj.plant import Mjcf, build_spec, compile_spec
-from dnnmso_mj.reading import read_trace
-from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.plant import build_spec, compile_spec
+from dnnmso_mj.reading import Snapshot
+from dnnmso_mj.recorded import Recorded, read_recorded
 from dnnmso_mj.scene import Scene
+from dnnmso_mj.viewer.plot import TIMELINE
 from dnnmso_mj.viewer.process import (
-    LOCAL,
-    check_port,
+    check_display,
     free_port,
     headless_viewer,
-    listens,
     picture,
     rerun,
+    until_interrupted,
 )
-from dnnmso_mj.viewer.signals import TIMELINE
+from dnnmso_mj.viewer.summary import drawable
+from dnnmso_mj.viewer.web import web_server
+
+Logs = Path | Sequence[Path]
 
 
-def save_rrd(log: Path, out: Path, first_tab: str = "Tracking") -> Path:
-    """Convert a log to a Rerun recording that carries its own layout.
+def save_rrd(
+    logs: Logs, out: Path, first_tab: str = "Tracking", *, side_by_side: bool = False
+) -> Path:
+    """Convert logs to a Rerun recording that carries its own layout.
 
     Args:
-        log: an MCAP log, complete or torn.
+        logs: MCAP logs, complete or torn, of robots with as many joints.
         out: the .rrd to write; an existing one is replaced once the new one is whole.
-        first_tab: the tab of plots that is open at first: Tracking, Motion, Learning (of a run
-            with a network), Theory or Timing.
+        first_tab: the tab of plots that is open at first: Tracking, Learning (of a controller that
+            learns), Theory, Timing or Scene.
+        side_by_side: whether the arms of several logs stand beside one another.
 
     Returns:
         `out`.
 
     Raises:
-        LogError: the log cannot be read, has no such tab, or `out` cannot be written; nothing is
-            left behind.
+        LogError: a log cannot be read or shown with the others, has no such tab, or `out` cannot
+            be written; nothing is left behind.
         MissingExtraError: rerun is not installed.
     """
     with _replacing(out, ".rrd") as partial:
-        _convert(log, partial, first_tab)
+        _convert(_several(logs), partial, first_tab, side_by_side)
     return out
 
 
-def open_viewer(log: Path) -> None:
-    """Show a log in the native viewer, until its window is closed or Ctrl-C.
+def open_viewer(logs: Logs, first_tab: str = "Tracking", *, side_by_side: bool = False) -> None:
+    """Show logs in the native viewer, until its window is closed or Ctrl-C.
 
     Raises:
         DnnmsoError: there is no display, or the viewer cannot start.
         LogError, MissingExtraError: as `save_rrd`.
     """
-    if sys.platform == "linux" and not _has_display():
-        raise DnnmsoError(
-            "no display: neither DISPLAY nor WAYLAND_DISPLAY is set. Use `dnnmso replay` with "
-            "--serve (a browser), --screenshot FILE.png, or --save FILE.rrd"
-        )
+    check_display(
+        "Use `dnnmso replay` with --serve (a browser), --screenshot FILE.png, or --save FILE.rrd"
+    )
     with (
-        _until_interrupted(),
-        _converted(log) as (rrd, _),
+        until_interrupted(),
+        _converted(logs, first_tab, side_by_side) as (rrd, _),
         rerun("--port", str(free_port()), str(rrd)) as viewer,
     ):
         viewer.wait()
 
 
-def serve(log: Path, port: int = 9090) -> None:
-    """Show a log to browsers on this machine, and to no others, until Ctrl-C.
+def serve(
+    logs: Logs, port: int = 9090, first_tab: str = "Tracking", *, side_by_side: bool = False
+) -> None:
+    """Show logs to browsers on this machine, and to no others, until Ctrl-C.
 
     Args:
-        log: an MCAP log.
+        logs: MCAP logs.
         port: of the web page, whose address is printed on standard output.
+        first_tab, side_by_side: as in `save_rrd`.
 
     Raises:
         DnnmsoError: the port is taken, or the server cannot start.
         LogError, MissingExtraError: as `save_rrd`.
     """
-    check_port(port)
-    data_port, page = free_port(), f"http://{LOCAL}:{port}"
-    data = urllib.parse.quote(f"rerun+http://{LOCAL}:{data_port}/proxy", safe="")
-    arguments = ("--serve-web", "--web-viewer-port", str(port), "--port", str(data_port))
     with (
-        _until_interrupted(),
-        _converted(log) as (rrd, _),
-        rerun(*arguments, str(rrd)) as server,
+        until_interrupted(),
+        _converted(logs, first_tab, side_by_side) as (rrd, _),
+        web_server(port, str(rrd)) as server,
     ):
-        server.wait_until(lambda: listens(data_port) and _answers(page), "ready")
-        print(f"{page}/?url={data}", flush=True)
+        print(server.page, flush=True)
         print("Ctrl-C ends it.", file=sys.stderr)
-        server.wait()
+        server.process.wait()
 
 
 def screenshot(
-    log: Path,
+    logs: Logs,
     png: Path,
     *,
     t: float | None = None,
     tab: str = "Tracking",
     size: tuple[int, int] = (1600, 900),
+    side_by_side: bool = False,
 ) -> Path:
     """Draw the viewer's window to a file, without a display.
 
     Args:
-        log: an MCAP log.
+        logs: MCAP logs.
         png: the picture to write; an existing one is replaced once the new one is whole.
         t: simulated time to show (s); the end of the run by default.
         tab: the tab of plots to show, as `first_tab` of `save_rrd`.
         size: width and height (pixels).
+        side_by_side: as in `save_rrd`.
 
     Returns:
         `png`.
@@ -128,7 +127,10 @@ def screenshot(
         MissingExtraError: rerun is not installed, or the system has no Vulkan driver.
         LogError, DnnmsoError: as `save_rrd`; or the run has no time t; or a view shows nothing.
     """
-    with _replacing(png, ".png") as partial, _converted(log, tab) as (rrd, end):
+    with (
+        _replacing(png, ".png") as partial,
+        _converted(logs, tab, side_by_side) as (rrd, end),
+    ):
         if t is not None and not 0.0 <= t <= end:
             raise DnnmsoError(f"t = {t} s; allowed: 0 to {end:g} s, the end of the run")
         with headless_viewer(rrd, size) as client:
@@ -137,45 +139,71 @@ def screenshot(
     return png
 
 
-def _convert(log: Path, out: Path, first_tab: str) -> float:
-    """Write the recording of a log; returns the time of the run's last tick (s)."""
-    try:
-        from dnnmso_mj.viewer.rrd import rrd_bytes
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "rerun":
-            raise
-        raise MissingExtraError(
-            "the viewer needs rerun, which is not installed: pip install 'dnnmso_mj[viewer]'"
-        ) from error
-    trace = read_trace(log)
-    out.write_bytes(rrd_bytes(trace, _scene(log, trace.scenario), first_tab))
-    return float(trace["t"][-1])
+def _several(logs: Logs) -> Sequence[Path]:
+    return [logs] if isinstance(logs, Path) else logs
 
 
-def _scene(log: Path, scenario: Scenario) -> Scene:
-    """The robot of a log, from the model that the log holds and the scenario's masses and lengths.
+def _convert(logs: Sequence[Path], out: Path, first_tab: str, side_by_side: bool) -> float:
+    """Write the recording of some logs; returns the last time in it (s)."""
+    require("viewer", "the viewer")
+    from dnnmso_mj.viewer.rrd import Run, rrd_bytes
 
-    N.B. meshes and includes are not in the log: they are looked for where the model was.
+    runs = []
+    for name, log in zip(run_names(logs), logs, strict=True):
+        found = read_recorded(log)
+        snapshots = _snapshots(found)
+        runs.append(Run(name, found.trace, _scene(found), snapshots, found.segments))
+    out.write_bytes(rrd_bytes(runs, first_tab, side_by_side=side_by_side))
+    last_ticks = [float(run.trace["t"][-1]) for run in runs]
+    return max([*last_ticks, *(snapshot.t for run in runs for snapshot in run.snapshots)])
+
+
+def _snapshots(log: Recorded) -> list[Snapshot]:
+    """The states of its controller, in the order of time."""
+    name, dt = "controller", log.trace.scenario.dt
+    ticks = sorted(tick for tick, what in log.snapshots if what == name)
+    return [Snapshot(name, tick * dt, log.arrays(tick, name)) for tick in ticks]
+
+
+def run_names(logs: Sequence[Path]) -> list[str]:
+    """A name for each log that no other has: its file's, with its folder's or a number if need be.
+
+    Args:
+        logs: one or more; the same may be there twice.
     """
-    records = (r for r in Prefix(log) if isinstance(r, Attachment) and r.name == MODEL)
-    model = next(records, None)
-    if model is None:
-        raise LogError(f"{log}: no attachment {MODEL!r} to draw the robot from. Run it again.")
-    plant = scenario.plant
+    names = []
+    for log in logs:
+        stem = log.stem
+        folders = {other.resolve().parent for other in logs if other.stem == stem}
+        name = f"{log.resolve().parent.name}/{stem}" if len(folders) > 1 else stem
+        names.append(drawable(name))
+    before = [names[:k].count(name) for k, name in enumerate(names)]
+    return [f"{name} ({k + 1})" if k else name for name, k in zip(names, before, strict=True)]
+
+
+def _scene(log: Recorded) -> Scene:
+    """The robot of a log, from the model that it holds and its scenario's masses and lengths."""
+    data = log.files.get(MODEL)
+    if data is None:
+        raise LogError(f"{log.path}: no attachment {MODEL!r} to draw the robot from. Run it again.")
+    scenario = log.trace.scenario
     try:
-        mjcf = Mjcf(model.data.decode(), str(Path(plant.model).parent))
-        return Scene(compile_spec(build_spec(plant, scenario.dt, mjcf), plant.model))
+        with tempfile.TemporaryDirectory() as folder:
+            mjcf = put_back(data.decode(), log.assets, Path(folder))
+            spec = build_spec(scenario.plant, scenario.dt, mjcf)
+            return Scene(compile_spec(spec, scenario.plant.model))
     except (ScenarioError, UnicodeDecodeError) as error:
-        raise LogError(f"{log}: its robot cannot be drawn: {error}") from error
+        raise LogError(f"{log.path}: its robot cannot be drawn: {error}") from error
 
 
 @contextlib.contextmanager
-def _converted(log: Path, first_tab: str = "Tracking") -> Iterator[tuple[Path, float]]:
-    """A log's recording in a temporary file, and its last time (s)."""
+def _converted(logs: Logs, first_tab: str, side_by_side: bool) -> Iterator[tuple[Path, float]]:
+    """The recording of some logs in a temporary file, and the last time in it (s)."""
+    several = _several(logs)
     with tempfile.TemporaryDirectory(prefix="dnnmso-") as folder:
-        rrd = Path(folder) / f"{log.stem}.rrd"
+        rrd = Path(folder) / f"{several[0].stem}.rrd"
         try:
-            end = _convert(log, rrd, first_tab)
+            end = _convert(several, rrd, first_tab, side_by_side)
         except OSError as error:
             raise unwritable(rrd, error) from error
         yield rrd, end
@@ -197,31 +225,3 @@ def _replacing(path: Path, suffix: str) -> Iterator[Path]:
             partial.replace(path)
     except OSError as error:
         raise unwritable(path, error) from error
-
-
-@contextlib.contextmanager
-def _until_interrupted() -> Iterator[None]:
-    """Leave the block in good order at Ctrl-C, on SIGTERM, or when the terminal closes."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (SIGTERM, SIGHUP)}
-    try:
-        with contextlib.suppress(KeyboardInterrupt):
-            yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _has_display() -> bool:
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def _answers(page: str) -> bool:
-    try:
-        with urllib.request.urlopen(page, timeout=1.0) as response:  # noqa: S310
-            return bool(response.status == HTTPStatus.OK)
-    except OSError:
-        return False

@@ -131,6 +131,13 @@ class Scene:
             point = poses[..., k, :3] + rotate(poses[..., k, 3:], point)
         return point
 
+    @property
+    def reach(self) -> float:
+        """How far a point of the robot can be from the origin (m), roughly."""
+        frames = sum(float(np.linalg.norm(link.xyz)) for link in self.links)
+        shapes = [float(np.linalg.norm(geom.xyz)) + max(geom.size) for geom in self.geoms]
+        return frames + max(shapes, default=0.0)
+
     def urdf(self) -> str:
         """The links, joints, shapes and masses as URDF text.
 

@@ -190,7 +190,13 @@ class Trace:
 
         A column of vectors is split: `q` of two joints into `q1` and `q2`, `x_hat` into `x_hat1` to
         `x_hat4`. Each field's metadata has its `unit`, the table's the scenario and seed.
+
+        Raises:
+            MissingExtraError: pyarrow is not installed.
         """
+        from dnnmso_mj.extras import require
+
+        require("sweep", "Trace.table")
         from dnnmso_mj.trace_table import trace_table
 
         return trace_table(self)
@@ -210,7 +216,11 @@ class Trace:
 
         Raises:
             DnnmsoError: the run has no tick.
+            MissingExtraError: matplotlib is not installed.
         """
+        from dnnmso_mj.extras import require
+
+        require("plot", "Trace.plot")
         from dnnmso_mj.plots import overview
 
         return overview(self)

@@ -135,7 +135,7 @@ def test_the_command_says_it_and_so_does_its_exit_status(tmp_path):
     assert said["columns"][0]["largest"]["difference"] == pytest.approx(0.25)
     bad = diff(one, tmp_path / "none.mcap")
     assert (bad.returncode, bad.stdout) == (2, "")
-    assert "none.mcap cannot be read" in bad.stderr
+    assert "none.mcap: no such log" in bad.stderr
 
 
 def test_what_is_no_log_is_refused(tmp_path):

@@ -174,13 +174,14 @@ def test_to_begin_anew_after_restoring_keeps_what_was_learned_and_forgets_the_re
 
 @KINDS
 def test_a_log_says_what_was_run_and_can_be_drawn_replayed_and_resumed(kind, tmp_path: Path):
-    from dnnmso_mj.viewer.rrd import rrd_bytes  # not at collection: an optional library
+    from dnnmso_mj.viewer.rrd import Run, rrd_bytes  # not at collection: an optional library
 
     logged = run_logged(imperfect(kind), tmp_path / "run.mcap")
     trace = read_trace(logged.log)
     check_same(trace, compiled_run(kind))
     assert trace.scenario == imperfect(kind)
-    state = next(s for s in reversed(read_snapshots(logged.log)) if s.name == "controller").arrays
+    snapshots = read_snapshots(logged.log)
+    state = next(s for s in reversed(snapshots) if s.name == "controller").arrays
     assert set(state) == set(build_controller(imperfect(kind), arm()).state())
     assert trace.info.metrics["diverged"] is False
     assert (trace.info.metrics["bound_violations"] is None) == (
@@ -193,4 +194,4 @@ def test_a_log_says_what_was_run_and_can_be_drawn_replayed_and_resumed(kind, tmp
     resumed = resume(logged.log, 0.237, out=tmp_path / "resumed.mcap").run.log
     assert difference(logged.log, resumed).equal
     scene = Scene(Simulation(imperfect(kind), arm()).plant.model)
-    assert rrd_bytes(trace, scene)[:3] == b"RRF"
+    assert rrd_bytes([Run(kind, trace, scene, snapshots)])[:3] == b"RRF"

@@ -359,12 +359,12 @@ def spoil(*names: str, sets: tuple[str, ...] = (), **settings) -> Scenario:
 
 
 def test_readings_and_torques_are_changed_where_the_page_says(laws):
-    limits = ("imperfections.torque_limit=40", "imperfections.position_bias=0.02")
+    limits = ("imperfections.torque_limit=60", "imperfections.position_bias=0.02")
     trace = simulate(spoil("Off", "Off", sets=limits))
     assert np.allclose(trace["q_meas"] - trace["q"], 0.02 + 2 * 0.01)
     assert np.allclose(trace["qd_meas"] - trace["qd"], 2 * 0.01)
-    assert np.abs(trace["tau_cmd"]).max() > 160
-    assert np.array_equal(trace["tau"], np.clip(0.25 * trace["tau_cmd"], -40, 40))
+    assert np.abs(trace["tau_cmd"]).max() > 240
+    assert np.array_equal(trace["tau"], np.clip(0.25 * trace["tau_cmd"], -60, 60))
     # What the network should learn is that of the arm, whatever its motors made of the command.
     free = TwoLink((1.0, 2.3), (1.0, 1.0)).acceleration(
         trace["q"], trace["qd"], np.zeros_like(trace["q"])

@@ -104,7 +104,7 @@ def test_each_step_of_the_controller_helps_and_what_cannot_be_kept_is_refused(ex
 def test_the_log_tells_of_the_payload_and_of_snapshots(executed):
     said = text(executed["reading_a_log"])
     assert "1 kg taken up at the tip" in said
-    assert re.findall(r"^ +(\d) s  controller: \d+ weights", said, re.MULTILINE) == list("0123")
+    assert re.findall(r"^ +(\d) s  \d+ weights", said, re.MULTILINE) == list("0123")
     assert "f_hat4   rad/s²" in said
 
 

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from dnnmso_mj.errors import ScenarioError
+from dnnmso_mj.errors import LogError, ScenarioError
 from dnnmso_mj.paths import (
+    find_log,
     find_model,
     find_scenario,
     logs_dir,
@@ -18,6 +19,7 @@ from dnnmso_mj.paths import (
     models_dir,
     scenarios_dir,
 )
+from dnnmso_mj.reading import log_info, read_snapshots, read_trace, recover
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -145,3 +147,65 @@ def test_an_installed_wheel_finds_its_models_and_scenarios(tmp_path: Path) -> No
     shipped = REPOSITORY / "scenarios"
     files = [*shipped.glob("*.yaml"), *(shipped / "literature").glob("*.yaml")]
     assert set(names.split()) == {str(p.relative_to(shipped).with_suffix("")) for p in files}
+
+
+@pytest.fixture
+def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with logs of different ages, the current one."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "logs").mkdir()
+    for age, name in enumerate(("paper", "paper-2", "push", "paper.v2")):
+        log = tmp_path / "logs" / f"{name}.mcap"
+        log.write_bytes(b"")
+        os.utime(log, (age, age))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("paper", "logs/paper.mcap"),  # that one, and not the newest of its scenario
+        ("paper-2", "logs/paper-2.mcap"),
+        ("paper.mcap", "logs/paper.mcap"),
+        ("paper.v2", "logs/paper.v2.mcap"),
+        ("last", "logs/paper.v2.mcap"),
+        ("logs/push.mcap", "logs/push.mcap"),
+        (Path("push"), "logs/push.mcap"),
+    ],
+)
+def test_a_log_is_found_by_its_name_or_as_the_last(logs: Path, source: str, found: str) -> None:
+    assert find_log(source) == Path(found)
+
+
+def test_a_file_wins_over_a_name_and_a_name_over_a_folder(logs: Path) -> None:
+    (logs / "push").mkdir()
+    assert find_log("push") == Path("logs/push.mcap")
+    (logs / "paper").write_bytes(b"")
+    assert find_log("paper") == Path("paper")
+    (logs / "logs" / "last.mcap").write_bytes(b"")
+    os.utime(logs / "logs" / "last.mcap", (0, 0))
+    assert find_log("last") == Path("logs/last.mcap")
+    assert find_log("logs") == Path("logs")  # what reads it says that it is a folder
+
+
+def test_an_unknown_log_is_refused_with_the_nearest_and_the_newest(logs: Path) -> None:
+    with pytest.raises(LogError) as refused:
+        find_log("pusch")
+    assert str(refused.value) == (
+        "pusch: no such log; allowed: a log file (.mcap), last, or one of logs, the newest first: "
+        "paper.v2, push, paper-2, paper; did you mean 'push'?"
+    )
+    for log in (logs / "logs").iterdir():
+        log.unlink()
+    with pytest.raises(LogError, match="last: no such log, and none in logs; allowed: "):
+        find_log("last")
+    for number in range(20):
+        (logs / "logs" / f"run-{number}.mcap").write_bytes(b"")
+    with pytest.raises(LogError, match=r"(run-\d+, ){8}…$"):
+        find_log("nothing")
+
+
+def test_whatever_reads_logs_takes_their_names(logs: Path) -> None:
+    for read in (read_trace, log_info, read_snapshots, lambda name: recover(name, "out.mcap")):
+        with pytest.raises(LogError, match=r"logs/push\.mcap is empty"):
+            read("push")

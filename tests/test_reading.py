@@ -191,7 +191,7 @@ def with_step(
 
 
 REFUSALS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "missing": (lambda path: None, "cannot be read: No such file or directory"),
+    "missing": (lambda path: None, "no such log, and none in logs; allowed: a log file"),
     "directory": (Path.mkdir, "is a directory; allowed: an MCAP file"),
     "fifo": (os.mkfifo, "is not a regular file"),
     "empty": (Path.touch, "is empty; expected an MCAP file"),

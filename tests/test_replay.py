@@ -9,26 +9,38 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from replay_samples import (
+    all_plots,
+    entities,
+    read_bands,
+    read_component,
+    read_lines,
+    read_times,
+)
 
 from dnnmso_mj.errors import DnnmsoError, LogError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.plant import Mjcf, build_spec, compile_spec
-from dnnmso_mj.reading import read_trace
+from dnnmso_mj.reading import read_snapshots, read_trace
 from dnnmso_mj.replay import save_rrd
 from dnnmso_mj.run import run_logged
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.trace import Array, Trace
-from dnnmso_mj.viewer.signals import Plot, joint_color, plot_tabs
+from dnnmso_mj.trace import Trace
 
 SHORT = ("duration=0.6", "controller.network.hidden=[8, 8]")
 SHAPE = ("plant.lengths=[0.7, 1.2]", "plant.masses=[1.0, 1.5]", "imperfections.torque_limit=45")
+EVENTS = (
+    "events=[{kind: push, at: 0.1, duration: 0.05, torque: [5.0, 0.0]}, "
+    "{kind: payload, at: 0.2, mass: 0.5}, {kind: payload, at: 0.4, mass: -0.5}, "
+    "{kind: freeze, at: 0.5}]",
+)
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short run of the paper's controller on another arm, with a torque limit it reaches."""
+    """A short run of the paper's controller on another arm, of which much happens to it."""
     out = tmp_path_factory.mktemp("log") / "paper.mcap"
-    return run_logged(load_scenario("paper", (*SHORT, *SHAPE)), out).log
+    return run_logged(load_scenario("paper", (*SHORT, *SHAPE, *EVENTS)), out).log
 
 
 @pytest.fixture(scope="module")
@@ -48,82 +60,37 @@ def rrd(log: Path) -> Path:
     return save_rrd(log, log.with_suffix(".rrd"))
 
 
-def read_component(rrd: Path, entity: str, component: str) -> list:
-    """All rows of a component that an entity has, in the order of time."""
-    from rerun.chunk import RrdReader
-
-    rows: list = []
-    for chunk in RrdReader(rrd).stream().filter(content=f"/{entity}"):
-        batch = chunk.to_record_batch()
-        if component in batch.schema.names:
-            rows += batch[component].to_pylist()
-    return rows
-
-
-def read_lines(rrd: Path, plot: str, what: str = "lines") -> Array:
-    """The lines of a plot as written, shape (N, lines)."""
-    return np.array(read_component(rrd, f"plots/{plot}/{what}", "Scalars:scalars"))
-
-
-def entities(rrd: Path) -> set[str]:
-    from rerun.chunk import RrdReader
-
-    return {chunk.entity_path for chunk in RrdReader(rrd).stream()}
-
-
-def all_plots(trace: Trace) -> list[Plot]:
-    return [plot for plots in plot_tabs(trace).values() for plot in plots]
-
-
-def find_plot(trace: Trace, path: str) -> Plot:
-    return next(plot for plot in all_plots(trace) if plot.path == path)
-
-
-def with_columns(trace: Trace, **columns: Array) -> Trace:
-    return replace(trace, columns={**trace.columns, **columns})
-
-
 @pytest.mark.parametrize(
-    ("plot", "first", "names"),
+    ("plot", "names"),
     [
-        ("joint_angles", 0, ["q_ref", "q"]),
-        ("velocities", 0, ["qd_ref", "qd"]),
-        ("torque", 0, ["tau_cmd", "tau"]),
-        ("weight_norm", 0, ["weight_norm"]),
-        ("theorem_1", 0, ["eta_bound"]),
-        ("observer_velocity", 0, ["e_obs"]),
-        ("compute_time", 0, ["compute_us"]),
+        ("joint_angles", ["q_ref", "q"]),
+        ("velocities", ["qd_ref", "qd"]),
+        ("torque", ["tau_cmd", "tau"]),
+        ("weight_norm", ["weight_norm"]),
+        ("theorem_1", ["eta_bound"]),
+        ("compute_time", ["compute_us"]),
     ],
 )
 def test_a_plot_has_every_tick_of_the_log(
-    rrd: Path, trace: Trace, plot: str, first: int, names: list[str]
+    rrd: Path, trace: Trace, plot: str, names: list[str]
 ) -> None:
     columns = [trace[name].reshape(len(trace), -1) for name in names]
-    if plot == "observer_velocity":
-        columns = [column[:, trace.n_joints :] for column in columns]
     written = read_lines(rrd, plot)
     assert written.shape[0] == len(trace) == 600
     np.testing.assert_array_equal(written, np.concatenate(columns, axis=1))
 
 
 def test_learned_and_true_dynamics_stand_side_by_side(rrd: Path, trace: Trace) -> None:
-    for row in range(2 * trace.n_joints):
-        expected = np.stack([trace["f_true"][:, row], trace["f_hat"][:, row]], axis=1)
-        np.testing.assert_array_equal(read_lines(rrd, f"dynamics_{row + 1}"), expected)
+    n = trace.n_joints
+    for what, rows in (("velocity", slice(0, n)), ("acceleration", slice(n, 2 * n))):
+        expected = np.concatenate([trace["f_true"][:, rows], trace["f_hat"][:, rows]], axis=1)
+        np.testing.assert_array_equal(read_lines(rrd, f"dynamics_{what}"), expected)
 
 
-def test_every_column_of_a_log_is_plotted(trace: Trace) -> None:
-    noisy = with_columns(trace, q_meas=trace["q"] + 1e-3, qd_meas=trace["qd"] + 1e-3)
-    lines = [line.values for plot in all_plots(noisy) for line in plot.lines]
-    for name in set(noisy) - {"t", "x_hat"}:  # x_hat is x - e_obs
-        for column in noisy[name].reshape(len(noisy), -1).T.astype(float):
-            with np.errstate(divide="ignore"):
-                logarithm = np.log10(np.abs(column))
-            logarithm[np.isinf(logarithm)] = np.nan
-            assert any(
-                np.array_equal(values, column) or np.array_equal(values, logarithm, equal_nan=True)
-                for values in lines
-            ), name
+def test_the_knowledge_error_is_their_distance(rrd: Path, trace: Trace) -> None:
+    f_err, n = trace["f_true"] - trace["f_hat"], trace.n_joints
+    norms = [np.linalg.norm(f_err[:, rows], axis=1) for rows in (slice(n, 2 * n), slice(0, n))]
+    np.testing.assert_allclose(read_lines(rrd, "knowledge"), np.log10(norms).T)
 
 
 def test_times_and_ticks_are_those_of_the_log(rrd: Path, trace: Trace) -> None:
@@ -133,39 +100,14 @@ def test_times_and_ticks_are_those_of_the_log(rrd: Path, trace: Trace) -> None:
     assert read_component(rrd, entity, "tick") == list(range(len(trace)))
 
 
-def read_times(rrd: Path, entity: str) -> Array:
-    from rerun.chunk import RrdReader
-
-    chunks = [c.to_record_batch() for c in RrdReader(rrd).stream().filter(content=f"/{entity}")]
-    return np.concatenate([c["time"].to_numpy() for c in chunks if "time" in c.schema.names])
-
-
-def test_each_line_carries_its_own_name_and_colour(rrd: Path, trace: Trace) -> None:
-    for plot in all_plots(trace):
+def test_each_line_carries_its_own_name_and_colour(rrd: Path, trace: Trace, scene: Scene) -> None:
+    for plot in all_plots(trace, scene):
         entity = f"plots/{plot.path}/lines"
         [names] = read_component(rrd, entity, "SeriesLines:names")
         [colors] = read_component(rrd, entity, "SeriesLines:colors")
         assert names == [line.name for line in plot.lines]
         rgb = [tuple(color >> shift & 255 for shift in (24, 16, 8)) for color in colors]
         assert rgb == [line.color for line in plot.lines]
-
-
-def test_a_joint_has_one_colour_in_all_plots(trace: Trace) -> None:
-    for path, names in {
-        "joint_angles": ("q1", "q2"),
-        "error_log": ("|e1|", "|e2|"),
-        "torque": ("τ1", "τ2"),
-        "velocities": ("q̇1", "q̇2"),
-        "bounds": ("|e1|", "|e2|"),
-    }.items():
-        colors = {line.name: line.color for line in find_plot(trace, path).lines}
-        assert [colors[name] for name in names] == [joint_color(0), joint_color(1)]
-    assert joint_color(0) != joint_color(1)
-
-
-def test_every_plot_has_a_path_of_its_own(trace: Trace) -> None:
-    paths = [plot.path for plot in all_plots(trace)]
-    assert len(paths) == len(set(paths))
 
 
 @pytest.mark.parametrize(("root", "column"), [("arm", "q"), ("desired", "q_ref")])
@@ -191,6 +133,13 @@ def test_trail_follows_the_tip(rrd: Path, trace: Trace, scene: Scene) -> None:
     np.testing.assert_allclose(path, scene.tip(trace["q_ref"][::10]), atol=1e-6)
 
 
+def test_the_distance_of_the_tip_is_of_the_robot_in_the_log(
+    rrd: Path, trace: Trace, scene: Scene
+) -> None:
+    away = np.linalg.norm(scene.tip(trace["q"]) - scene.tip(trace["q_ref"]), axis=1)
+    np.testing.assert_allclose(read_lines(rrd, "tip")[:, 0], np.log10(away))
+
+
 def test_shapes_are_drawn_for_the_arm_and_for_its_ghost(rrd: Path, scene: Scene) -> None:
     found = entities(rrd)
     for root in ("arm", "desired"):
@@ -210,22 +159,65 @@ def test_torque_limit_is_drawn_over_the_whole_run(rrd: Path, trace: Trace) -> No
     np.testing.assert_allclose(times, trace["t"][[0, -1]])
 
 
-def test_each_joints_own_torque_limit_is_drawn_in_its_colour(trace: Trace) -> None:
-    limits = trace.scenario.imperfections.model_copy(update={"torque_limit": (45.0, 20.0)})
-    scenario = trace.scenario.model_copy(update={"imperfections": limits})
-    levels = find_plot(replace(trace, scenario=scenario), "torque").levels
-    assert [level.value for level in levels] == [45.0, -45.0, 20.0, -20.0]
-    assert [level.color for level in levels] == [joint_color(j) for j in (0, 0, 1, 1)]
-
-
 def test_events_are_there_with_their_time_and_level(rrd: Path, trace: Trace) -> None:
     assert trace.events  # or this test would see nothing
     texts = [text for [text] in read_component(rrd, "events", "TextLog:text")]
     levels = [level for [level] in read_component(rrd, "events", "TextLog:level")]
-    assert texts == [f"{event.t:.3f} s: {event.message}" for event in trace.events]
-    assert levels == [{"warning": "WARN", "info": "INFO"}[event.level] for event in trace.events]
+    expected = sorted(trace.events, key=lambda event: event.t)
+    assert texts == [f"{event.t:.3f} s: {event.message}" for event in expected]
+    assert levels == [{"warning": "WARN", "info": "INFO"}[event.level] for event in expected]
     times = read_times(rrd, "events") / np.timedelta64(1, "s")
-    np.testing.assert_allclose(times, [event.t for event in trace.events], atol=1e-9)
+    np.testing.assert_allclose(times, [event.t for event in expected], atol=1e-9)
+
+
+def test_bands_say_when_what_happens(rrd: Path, trace: Trace) -> None:
+    assert read_bands(rrd, "push") == [(0.0, ""), (0.1, "push"), (0.15, "")]
+    assert read_bands(rrd, "payload") == [(0.0, ""), (0.2, "+0.5 kg"), (0.4, "")]
+    assert read_bands(rrd, "learning") == [(0.0, ""), (0.5, "learning has ended")]
+    saturated = trace["saturated"]
+    changes = [0, *(1 + np.flatnonzero(np.diff(saturated.astype(int))))]
+    assert len(changes) > 2  # or this test would see nothing
+    words = {True: "torque limit", False: "running"}
+    assert read_bands(rrd, "run") == [
+        *((pytest.approx(trace["t"][k]), words[bool(saturated[k])]) for k in changes),
+        (0.6, ""),
+    ]
+
+
+def test_weights_are_pictures_of_the_snapshots(rrd: Path, log: Path) -> None:
+    first, last = (s.arrays["weights"] for s in read_snapshots(log) if s.name == "controller")
+    shapes = [(8, 5), (8, 9), (4, 9)]
+    ends = np.cumsum([rows * columns for rows, columns in shapes])
+    layers = zip(np.split(first, ends[:-1]), np.split(last, ends[:-1]), shapes, strict=True)
+    for k, (before, after, shape) in enumerate(layers, start=1):
+        for root, expected in {
+            "weights": [before, after],
+            "weight_ratios": [np.zeros(before.size), np.log10(after / before)],
+        }.items():
+            found = pictures(rrd, f"{root}/W{k}")
+            for picture, values in zip(found, expected, strict=True):
+                down, across = (a // b for a, b in zip(picture.shape, shape, strict=True))
+                entries = picture[::down, ::across]
+                np.testing.assert_allclose(entries, values.reshape(shape), rtol=1e-5, atol=1e-6)
+                assert np.array_equal(np.kron(entries, np.ones((down, across))), picture)
+
+
+def test_pictures_of_a_matrix_have_one_scale(rrd: Path) -> None:
+    for root in ("weights", "weight_ratios"):
+        *_, [scale] = read_component(rrd, f"{root}/W2", "DepthImage:depth_range")
+        within = [(np.abs(picture) <= scale[1]).mean() for picture in pictures(rrd, f"{root}/W2")]
+        assert scale[0] == -scale[1]
+        assert min(within) == pytest.approx(0.98, abs=0.02)  # the rest is past the last colour
+
+
+def pictures(rrd: Path, entity: str) -> list[np.ndarray]:
+    """The pictures of an entity in the order of time, as (height, width)."""
+    buffers = read_component(rrd, entity, "DepthImage:buffer")
+    formats = read_component(rrd, entity, "DepthImage:format")
+    return [
+        np.array(data, np.uint8).view(np.float32).reshape(size["height"], size["width"])
+        for [data], [size] in zip(buffers, formats, strict=True)
+    ]
 
 
 def test_the_layout_is_inside_the_recording(rrd: Path) -> None:
@@ -234,64 +226,22 @@ def test_the_layout_is_inside_the_recording(rrd: Path) -> None:
     reader = RrdReader(rrd)
     [layout], [recording] = reader.blueprints(), reader.recordings()
     assert layout.application_id == recording.application_id  # or the viewer would not use it
-    origins = [
-        origin
+    queries = [
+        query
         for chunk in reader.stream(store=layout)
-        if "ViewBlueprint:space_origin" in (batch := chunk.to_record_batch()).schema.names
-        for [origin] in batch["ViewBlueprint:space_origin"].to_pylist()
+        if "ViewContents:query" in (batch := chunk.to_record_batch()).schema.names
+        for lines in batch["ViewContents:query"].to_pylist()
+        for query in lines
     ]
-    plotted = {f"/{e}".rsplit("/", 1)[0].lstrip("/") for e in entities(rrd) if "/plots/" in e}
-    assert plotted == {origin.lstrip("/") for origin in origins if "plots/" in origin}
-
-
-def test_a_run_without_a_network_has_no_plots_of_one(tmp_path: Path) -> None:
-    out = tmp_path / "plain.mcap"
-    run_logged(load_scenario("paper_no_network", ("duration=0.05",)), out)
-    tabs = plot_tabs(read_trace(out))
-    assert list(tabs) == ["Tracking", "Motion", "Theory", "Timing"]
-    found = entities(save_rrd(out, tmp_path / "plain.rrd"))
-    assert "/plots/lyapunov/lines" in found
-    assert not any(
-        word in entity
-        for word in ("weight", "update", "theorem_1", "relative_trust", "dynamics")
-        for entity in found
-    )
-
-
-def test_measured_values_are_drawn_only_where_they_differ(trace: Trace) -> None:
-    exact = find_plot(trace, "joint_angles")
-    noisy = find_plot(with_columns(trace, q_meas=trace["q"] + 0.01), "joint_angles")
-    assert [line.name for line in exact.lines] == ["q1 ref", "q2 ref", "q1", "q2"]
-    assert "q2 measured" in [line.name for line in noisy.lines]
-
-
-def test_commanded_torque_is_drawn_only_where_it_differs(trace: Trace) -> None:
-    same = find_plot(with_columns(trace, tau_cmd=trace["tau"]), "torque")
-    assert "τ1 commanded" in [line.name for line in find_plot(trace, "torque").lines]
-    assert [line.name for line in same.lines] == ["τ1", "τ2"]
-
-
-def test_a_bound_that_does_not_exist_is_not_drawn(trace: Trace) -> None:
-    without = with_columns(trace, ultimate_bound=np.full(len(trace), -1.0))
-    names = [line.name for line in find_plot(trace, "bounds").lines]
-    left = [line.name for line in find_plot(without, "bounds").lines]
-    assert set(names) - set(left) == {"bound on |e|"}
-
-
-def test_logarithm_of_an_exact_zero_is_a_gap(trace: Trace) -> None:
-    q = trace["q"].copy()
-    q[7] = trace["q_ref"][7]
-    lines = find_plot(with_columns(trace, q=q), "error_log").lines
-    for line in lines:
-        assert np.isnan(line.values[7])
-        assert np.isfinite(np.delete(line.values, 7)).all()
+    plotted = {e.rsplit("/", 1)[0].lstrip("/") for e in entities(rrd) if "/plots/" in e}
+    assert {f"{path}/**" for path in plotted} == {q for q in queries if q.startswith("plots/")}
 
 
 def test_one_tick_is_enough(trace: Trace, scene: Scene, tmp_path: Path) -> None:
-    from dnnmso_mj.viewer.rrd import rrd_bytes
+    from dnnmso_mj.viewer.rrd import Run, rrd_bytes
 
     first = replace(trace, columns={name: trace[name][:1] for name in trace})
-    (tmp_path / "one.rrd").write_bytes(rrd_bytes(first, scene))
+    (tmp_path / "one.rrd").write_bytes(rrd_bytes([Run("one", first, scene)]))
     assert read_lines(tmp_path / "one.rrd", "joint_angles").shape == (1, 4)
 
 
@@ -305,12 +255,12 @@ def test_a_torn_log_is_shown_up_to_its_tear(log: Path, tmp_path: Path) -> None:
 
 
 def test_ten_thousand_ticks_stay_under_15_megabytes(trace: Trace, scene: Scene) -> None:
-    from dnnmso_mj.viewer.rrd import rrd_bytes
+    from dnnmso_mj.viewer.rrd import Run, rrd_bytes
 
     rng = np.random.default_rng(0)  # numbers that no compression makes smaller
     columns = {name: rng.uniform(size=(10_000, *trace[name].shape[1:])) for name in trace}
     columns["t"] = np.arange(10_000) * trace.scenario.dt
-    assert len(rrd_bytes(replace(trace, columns=columns), scene)) < 15e6
+    assert len(rrd_bytes([Run("long", replace(trace, columns=columns), scene)])) < 15e6
 
 
 def test_an_existing_file_is_replaced(log: Path, tmp_path: Path) -> None:
@@ -352,7 +302,7 @@ def test_a_folder_in_the_way_is_refused(log: Path, tmp_path: Path) -> None:
 
 
 def test_an_unknown_tab_is_refused_with_those_there_are(log: Path, tmp_path: Path) -> None:
-    message = "tab 'Learnin'; this run has: Tracking, Motion, Learning, Theory, Timing"
+    message = "tab 'Learnin'; allowed here: Tracking, Learning, Theory, Timing, Scene"
     with pytest.raises(DnnmsoError, match=message):
         save_rrd(log, tmp_path / "out.rrd", first_tab="Learnin")
     assert not list(tmp_path.iterdir())

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from outside_samples import LAWS
+from policy_samples import SOURCE
 from resume_samples import SCENARIOS
 
 from dnnmso_mj.branching import _refill
@@ -140,6 +141,15 @@ def test_events_of_the_new_scenario_that_were_before_are_in_force(pd):
     check_same(one.run.trace, other.run.trace)
 
 
+def test_a_push_that_is_taken_away_ends_there(tmp_path):
+    """As one that ends there: it is gone, and what it did in the last period is accounted for."""
+    push = "events=[{{kind: push, at: 0.1, duration: {}, torque: [9.0, 9.0]}}]"
+    log = log_of(tmp_path, ["controller={kind: no_network}", "duration=0.4", push.format(0.3)])
+    gone, ended = on(log, 0.3, "events=[]", name="gone"), on(log, 0.3, push.format(0.2), name="end")
+    check_same(gone.run.trace, ended.run.trace)
+    assert difference(gone.run.log, on(gone.run.log, 0.301, name="again").run.log).equal
+
+
 def test_frozen_weights_stay(learning):
     done = on(learning, 0.317, "events=[{kind: freeze, at: 0.317, what: model}]")
     first, branch, last = weights(done.run.log)
@@ -230,15 +240,15 @@ def test_a_ring_of_another_size_holds_the_same_past():
     assert [long[k % 8, 0] for k in range(4, 12)] == [7, 7, 7, 7, 8, 9, 10, 11]
 
 
-def test_a_bound_of_another_law_holds_from_its_first_tick(tmp_path):
+def test_a_bound_of_another_law_begins_at_the_present_error_and_holds(tmp_path):
     log = log_of(tmp_path, ["controller={kind: no_network}", "duration=0.6"])
-    for sets in (["controller.inversion.K=9"], ["reference.offset=0.1"]):
-        trace = on(log, 0.3, *sets).run.trace
-        error = np.abs(trace["q"] - trace["q_ref"]).max(axis=1)
-        assert (error[300:] <= 1.01 * trace["ultimate_bound"][300:] + 1e-9).all()
-        assert trace["ultimate_bound"][300] < 1.5 * np.linalg.norm(
-            (trace["q"] - trace["q_ref"])[300]
-        )
+    for changed in ("controller.inversion.K=9", "reference.offset=0.1"):
+        trace = on(log, 0.3, changed).run.trace
+        e, ed = trace["q"] - trace["q_ref"], trace["qd"] - trace["qd_ref"]
+        bound, paper = trace["ultimate_bound"], trace["ultimate_bound_paper"]
+        assert (np.abs(e).max(axis=1)[300:] <= bound[300:]).all()
+        assert bound[300] < 1.5 * np.linalg.norm(e[300])
+        assert paper[300] == pytest.approx(np.linalg.norm([e[300], ed[300]]), rel=1e-12)
 
 
 def test_a_longer_run_goes_on_where_the_shorter_one_ended(pd):
@@ -298,6 +308,19 @@ def test_code_from_outside_goes_on_too_if_it_is_trusted(tmp_path):
     assert resume(log, 0.3, [other], trust=True).told == ""
     gone = resume(log, 0.3, ["imperfections.external=[]"], trust=True).run.trace
     assert np.array_equal(gone["q_meas"][300:], gone["q"][300:])
+
+
+def test_a_policy_goes_on_from_what_it_remembers(tmp_path):
+    (tmp_path / "policies.py").write_text(SOURCE)
+    sets = [
+        f"controller={{kind: policy, python: '{tmp_path}/policies.py:Counter'}}",
+        "duration=0.2",
+    ]
+    log = run_logged(load_scenario("paper", sets, trust=True), tmp_path / "run.mcap").log
+    again = resume(log, 0.12, out=tmp_path / "again.mcap", trust=True).run.log
+    assert difference(log, again).equal
+    faster = resume(log, 0.12, ["controller.torque_scale=9"], trust=True)
+    assert faster.told.endswith("the controller goes on as it is")
 
 
 def test_a_torn_log_is_run_to_its_end(pd):

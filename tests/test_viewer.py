@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -12,22 +12,41 @@ import time
 import urllib.parse
 import urllib.request
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from replay_samples import opened_tabs
+from rerun_programs import children, listening_addresses, ports_of
 from vulkan import needs_vulkan
 
 from dnnmso_mj.errors import DnnmsoError, LogError, MissingExtraError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.replay import open_viewer, save_rrd, screenshot, serve
 from dnnmso_mj.run import run_logged
+from dnnmso_mj.viewer.plot import JOINT_COLORS
 from dnnmso_mj.viewer.process import LOCAL, free_port, headless_viewer, listens, picture, rerun
-from dnnmso_mj.viewer.signals import JOINT_COLORS
+
+if TYPE_CHECKING:
+    from rerun.experimental import ViewerClient
 
 SIZE = (1200, 700)
+LEFT = 300  # px, the width of the arm's column
 TRAIL = (255, 220, 90)
+AT_LIMIT = (172, 141, 0)  # the viewer draws bands darker than it is told
+BLUE, ORANGE = JOINT_COLORS[:2]
+WHITE = (235, 235, 235)
+# Tab -> colours that each of its columns of plots must show, from left to right.
+SHOWN = {
+    "Tracking": [(BLUE, ORANGE), (BLUE, ORANGE)],
+    "Learning": [(BLUE, ORANGE, WHITE), ((240, 110, 210), (0, 105, 160))],
+    "Theory": [((240, 110, 210), WHITE), (WHITE, BLUE, ORANGE)],
+    "Timing": [(BLUE, WHITE)],
+    "Scene": [(TRAIL, BLUE)],
+}
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +60,23 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_logged(load_scenario("paper", overrides), out).log
 
 
-def pixels(png: Path) -> np.ndarray:
+@pytest.fixture(scope="module")
+def rrd(log: Path) -> Path:
+    return save_rrd(log, log.with_suffix(".rrd"))
+
+
+@pytest.fixture(scope="module")
+def viewer(rrd: Path) -> Iterator[ViewerClient]:
+    """One viewer for all that can be tried in it, at the end of the run."""
+    with headless_viewer(rrd, SIZE) as client:
+        client.set_time("time", duration=0.6, play_state="paused")
+        yield client
+
+
+def pixels(png: Path | bytes) -> np.ndarray:
     """The picture as integers, shape (height, width, 3)."""
-    return np.round(imread(png)[..., :3] * 255).astype(int)
+    source = BytesIO(png) if isinstance(png, bytes) else png
+    return np.round(imread(source, format="png")[..., :3] * 255).astype(int)
 
 
 def count(image: np.ndarray, color: tuple[int, int, int], tolerance: int = 12) -> int:
@@ -51,46 +84,68 @@ def count(image: np.ndarray, color: tuple[int, int, int], tolerance: int = 12) -
 
 
 @needs_vulkan
-@pytest.mark.parametrize("tab", ["Tracking", "Motion", "Learning", "Theory", "Timing"])
-def test_every_tab_shows_its_plots_and_the_arm(log: Path, tmp_path: Path, tab: str) -> None:
-    """`screenshot` raises when a view reports that it cannot show its data."""
-    image = pixels(screenshot(log, tmp_path / "shown.png", tab=tab, size=SIZE))
-    assert image.shape == (SIZE[1], SIZE[0], 3)
-    arm, plots = image[:500, :480], image[:, 480:]
-    blue, orange = JOINT_COLORS[:2]
-    assert count(arm, TRAIL) > 50
-    assert count(arm, blue, 60) > 40  # the pin of joint 1
-    if tab == "Theory":
-        assert count(plots, (235, 235, 235)) > 200  # the bounds, and η
-    else:
-        assert count(plots, blue) > 200
-    if tab != "Timing":
-        assert count(plots, orange) > 200
-    assert list(tmp_path.iterdir()) == [tmp_path / "shown.png"]
+def test_every_tab_shows_the_arm_what_happens_and_its_plots(viewer: ViewerClient) -> None:
+    """`picture` raises when a view reports that it cannot show its data."""
+    seen = []
+    for tab in opened_tabs(viewer):
+        image = pixels(picture(viewer))
+        seen.append(tab)
+        assert image.shape == (SIZE[1], SIZE[0], 3)
+        arm, plots = image[40:300, :LEFT], image[60:, LEFT:]
+        assert count(arm, TRAIL) > 30
+        assert count(arm, BLUE, 60) > 10  # the pin of joint 1
+        for column, colors in zip(
+            np.array_split(plots, len(SHOWN[tab]), 1), SHOWN[tab], strict=True
+        ):
+            assert count(column, AT_LIMIT) > 1000, tab
+            for color in colors:
+                assert count(column, color, 30) > 100, (tab, color)
+    assert seen == list(SHOWN)
+    errors = [entry for entry in viewer.get_logs() if entry.level == "ERROR"]
+    assert errors == []
 
 
 @needs_vulkan
-def test_the_arm_moves_with_time(log: Path, tmp_path: Path) -> None:
-    first = pixels(screenshot(log, tmp_path / "first.png", t=0.0, size=SIZE))[40:500, :480]
-    last = pixels(screenshot(log, tmp_path / "last.png", size=SIZE))[40:500, :480]
-    assert (np.abs(first - last).max(axis=-1) > 30).sum() > 500
+def test_the_arm_moves_with_time(viewer: ViewerClient) -> None:
+    images = []
+    for t in (0.0, 0.6):
+        viewer.set_time("time", duration=t, play_state="paused")
+        images.append(pixels(picture(viewer))[40:300, :LEFT])
+    first, last = images
+    assert (np.abs(first - last).max(axis=-1) > 30).sum() > 300
     assert count(first, TRAIL) < 20 < count(last, TRAIL)  # the trail is what has been gone
 
 
 @needs_vulkan
-def test_a_loaded_log_has_its_whole_time_and_no_complaints(log: Path, tmp_path: Path) -> None:
-    rrd = save_rrd(log, tmp_path / "paper.rrd")
-    with headless_viewer(rrd, SIZE) as client:
-        picture(client)
-        state = client.get_state()
-        [recording] = state.recordings
-        timelines = {line.name: (line.start, line.end) for line in recording.timelines}
-        assert timelines == {"time": (0, 599_000_000), "tick": (0, 599)}
-        assert recording.current_timeline == "time"
-        assert {"Joint angles (rad)", "Torque (N·m)", "Run", "Events"} <= {
-            view.name for view in state.views
-        }
-        assert [entry for entry in client.get_logs() if entry.level == "ERROR"] == []
+def test_a_loaded_log_has_its_whole_time(viewer: ViewerClient) -> None:
+    [recording] = viewer.get_state().recordings
+    timelines = {line.name: (line.start, line.end) for line in recording.timelines}
+    assert timelines == {"time": (0, 600_000_000), "tick": (0, 600)}
+    assert recording.current_timeline == "time"
+
+
+@needs_vulkan
+def test_two_logs_are_compared_in_one_picture(log: Path, tmp_path: Path) -> None:
+    other = run_logged(
+        load_scenario("paper", ("duration=0.3",), controller="pd"), tmp_path / "pd.mcap"
+    )
+    image = pixels(screenshot([log, other.log], tmp_path / "both.png", size=(1200, 900)))
+    assert {path.name for path in tmp_path.iterdir()} == {"both.png", "pd.mcap"}
+    arms, plots = image[40:400, :LEFT], image[200:, LEFT:]
+    for color in (BLUE, ORANGE):
+        assert count(plots, color, 30) > 200
+        assert count(arms, color, 60) > 30
+    band = np.abs(image[60:200, LEFT:] - 0.55 * np.array(ORANGE)).max(axis=-1) < 12
+    wide = np.flatnonzero(band.sum(axis=0) > 10)  # half of each of two columns of plots
+    assert 400 < wide.size < 500
+
+
+@needs_vulkan
+def test_a_picture_is_of_its_time_and_its_tab(log: Path, tmp_path: Path) -> None:
+    image = pixels(screenshot(log, tmp_path / "first.png", t=0.0, tab="Scene", size=SIZE))
+    assert count(image, TRAIL) < 20
+    assert count(image[200:500, LEFT:], BLUE, 60) > 50  # the large arm's first pin
+    assert list(tmp_path.iterdir()) == [tmp_path / "first.png"]
 
 
 @needs_vulkan
@@ -113,29 +168,23 @@ def test_a_view_that_cannot_be_drawn_is_an_error(tmp_path: Path) -> None:
 
 @needs_vulkan
 def test_a_time_outside_the_run_is_refused(log: Path, tmp_path: Path) -> None:
-    with pytest.raises(DnnmsoError, match=r"t = 7\.0 s; allowed: 0 to 0\.599 s"):
+    with pytest.raises(DnnmsoError, match=r"t = 7\.0 s; allowed: 0 to 0\.6 s"):
         screenshot(log, tmp_path / "never.png", t=7.0)
     assert not list(tmp_path.iterdir())
 
 
 @needs_vulkan
-def test_a_viewer_that_dies_is_an_error_not_a_traceback(log: Path, tmp_path: Path) -> None:
-    rrd = save_rrd(log, tmp_path / "paper.rrd")
+def test_a_viewer_that_dies_is_an_error_not_a_traceback(rrd: Path) -> None:
+    before = set(children())
 
     def look_while_it_dies() -> None:
         with headless_viewer(rrd, SIZE) as client:
-            [group] = children()
+            [group] = set(children()) - before
             os.killpg(group, signal.SIGKILL)
             picture(client)
 
     with pytest.raises(DnnmsoError, match="Rerun's viewer failed"):
         look_while_it_dies()
-
-
-def children() -> list[int]:
-    """The Rerun programs that this process has started and that still run; each leads a group."""
-    pids = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
-    return [int(pid) for pid in pids if b"rerun_cli" in Path(f"/proc/{pid}/cmdline").read_bytes()]
 
 
 def test_without_a_vulkan_driver_the_message_names_the_packages(
@@ -187,43 +236,40 @@ def test_a_port_that_does_not_exist_is_refused(log: Path, port: int) -> None:
         serve(log, port)
 
 
-@pytest.fixture
-def server(log: Path, tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+Server = tuple[subprocess.Popen[str], str]
+
+
+@contextlib.contextmanager
+def serving(log: Path, folder: Path) -> Iterator[Server]:
     """A process that serves the log, and the address that it printed."""
     code = (
         "import sys; from pathlib import Path; from dnnmso_mj.replay import serve\n"
         "serve(Path(sys.argv[1]), int(sys.argv[2]))"
     )
     command = [sys.executable, "-c", code, str(log), str(free_port())]
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}  # what a killed one leaves goes there
+    environment = {**os.environ, "TMPDIR": str(folder)}  # what a killed one leaves goes there
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout is not None
         yield process, process.stdout.readline().strip()
         process.terminate()
 
 
-def ports_of(address: str) -> tuple[int, int]:
-    """Of the page, and of the data that it loads."""
-    url = urllib.parse.urlsplit(address)
-    data = urllib.parse.parse_qs(url.query)["url"][0]
-    assert data.startswith(f"rerun+http://{LOCAL}:")
-    return int(url.port or 0), int(re.findall(r":(\d+)/proxy", data)[0])
+@pytest.fixture
+def server(log: Path, tmp_path: Path) -> Iterator[Server]:
+    """One that a test may end."""
+    with serving(log, tmp_path) as served:
+        yield served
 
 
-def listening_addresses(port: int) -> set[str]:
-    """Local addresses, as the kernel writes them, on which somebody listens at a port."""
-    listening = "0A"
-    return {
-        address
-        for table in ("/proc/net/tcp", "/proc/net/tcp6")
-        for fields in (line.split() for line in Path(table).read_text().splitlines()[1:])
-        for address, hex_port in [fields[1].split(":")]
-        if int(hex_port, 16) == port and fields[3] == listening
-    }
+@pytest.fixture(scope="module")
+def lasting_server(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """One that no test ends."""
+    with serving(log, tmp_path_factory.mktemp("served")) as served:
+        yield served
 
 
-def test_a_served_log_is_for_this_machine_only(server: tuple[subprocess.Popen[str], str]) -> None:
-    _, address = server
+def test_a_served_log_is_for_this_machine_only(lasting_server: Server) -> None:
+    _, address = lasting_server
     with urllib.request.urlopen(address, timeout=10) as response:
         assert response.status == 200
         assert "Rerun" in response.read().decode()
@@ -232,9 +278,7 @@ def test_a_served_log_is_for_this_machine_only(server: tuple[subprocess.Popen[st
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_serving_ends_clean(
-    server: tuple[subprocess.Popen[str], str], number: signal.Signals
-) -> None:
+def test_serving_ends_clean(server: Server, number: signal.Signals) -> None:
     process, address = server
     assert all(listens(port) for port in ports_of(address))
     process.send_signal(number)
@@ -243,7 +287,7 @@ def test_serving_ends_clean(
 
 
 def test_a_killed_server_leaves_nothing_running(
-    server: tuple[subprocess.Popen[str], str],
+    server: Server,
 ) -> None:
     process, address = server
     process.kill()
@@ -255,10 +299,10 @@ def test_a_killed_server_leaves_nothing_running(
 
 
 @needs_vulkan
-def test_a_served_log_reaches_a_viewer(server: tuple[subprocess.Popen[str], str]) -> None:
+def test_a_served_log_reaches_a_viewer(lasting_server: Server) -> None:
     from rerun.experimental import ViewerClient
 
-    _, data_port = ports_of(server[1])
+    _, data_port = ports_of(lasting_server[1])
     port, data = free_port(), f"rerun+http://{LOCAL}:{data_port}/proxy"
     arguments = ("--headless", "--port", str(port), "--window-size", "800x600", "--connect", data)
     with rerun(*arguments) as viewer:

@@ -14,12 +14,15 @@ from io import TextIOWrapper
 from typing import Annotated, NoReturn
 
 import typer
+from typer.completion import completion_init
 
 from dnnmso_mj.cli import (
     audit,
     bench,
     check,
     compare,
+    completion,
+    doctor,
     logs,
     margins,
     report,
@@ -29,8 +32,11 @@ from dnnmso_mj.cli import (
     sweep,
     tune,
 )
-from dnnmso_mj.cli.shared import BAD_INPUT, INTERRUPTED
+from dnnmso_mj.cli.shared import BAD_INPUT, INTERRUPTED, say
 from dnnmso_mj.errors import DnnmsoError
+from dnnmso_mj.extras import extra_of, pip_install
+
+COMPLETE = "_DNNMSO_COMPLETE"  # set by a shell that asks for completions
 
 app = typer.Typer(
     help="Run, prove, replay and measure the DNN-MSO controller on a MuJoCo arm.",
@@ -48,6 +54,8 @@ def main() -> NoReturn:
     warnings.showwarning = _Warnings().show
     warnings.simplefilter("always", UserWarning)
     _degrade()
+    if COMPLETE in os.environ:
+        completion_init()
     status = _run()
     try:
         if sys.stdout is not None:
@@ -69,18 +77,22 @@ def _run() -> int:
             print(f"interrupted; {cause}" if str(cause or "") else "interrupted", file=sys.stderr)
         return end.code if isinstance(end.code, int) else 0
     except DnnmsoError as error:
-        print(f"error: {error}", file=sys.stderr)
+        say("error", str(error))
     except OSError as error:
         if error.filename is None and error.errno in FULL:
             return _refused_output(error)
-        print(f"error: {error.filename or ''}: {error.strerror}", file=sys.stderr)
+        say("error", f"{error.filename or ''}: {error.strerror}")
     except (RuntimeError, ImportError, SystemError) as error:
         if _interrupted(error):
             print("interrupted", file=sys.stderr)
             return INTERRUPTED
-        if "cannot cache function" not in str(error):
+        name = (error.name or "") if isinstance(error, ImportError) else ""
+        if extra := extra_of(name):
+            say("error", f"{name} is not installed: {pip_install(extra)}")
+        elif "cannot cache function" in str(error):
+            say("error", NO_CACHE)
+        else:
             raise
-        print(f"error: {NO_CACHE}", file=sys.stderr)
     return BAD_INPUT
 
 
@@ -126,7 +138,7 @@ class _Warnings:
     ) -> None:
         if issubclass(category, UserWarning) and str(message) not in self._shown:
             self._shown.add(str(message))
-            print(f"warning: {message}", file=sys.stderr)
+            say("warning", str(message))
 
 
 def _print_version(wanted: bool) -> None:
@@ -163,4 +175,8 @@ app.command()(resume.resume)
 app.command()(resume.diff)
 app.command()(scenarios.schema)
 app.command()(scenarios.scenarios)
+app.command()(scenarios.controllers)
+app.command()(scenarios.new)
 app.command()(bench.bench)
+app.command()(doctor.doctor)
+app.command()(completion.completion)

@@ -9,15 +9,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dnnmso_mj.cli.completing import complete_controllers
 from dnnmso_mj.cli.shared import (
     Json,
     Overrides,
+    ScenarioName,
     Trust,
     near,
     print_table,
     progress_bar,
     working,
 )
+from dnnmso_mj.extras import require
 
 if TYPE_CHECKING:
     from dnnmso_mj.audit.run import Audit
@@ -28,9 +31,14 @@ TIMES_SHOWN = 2  # side by side, in 80 columns
 
 
 def audit(
-    scenario: Annotated[str, typer.Argument(help="A scenario file, or the name of a shipped one.")],
+    scenario: ScenarioName,
     controllers: Annotated[
-        str | None, typer.Option(metavar="NAME,NAME", help="Default: the scenario's own.")
+        str | None,
+        typer.Option(
+            metavar="NAME,NAME",
+            autocompletion=complete_controllers,
+            help="Default: the scenario's own.",
+        ),
     ] = None,
     at: Annotated[str, typer.Option(metavar="T,T", help="When to freeze (s).")] = "10,25,50",
     seeds: Annotated[str, typer.Option(metavar="START:STOP", help="Or a number, or a list.")] = (
@@ -45,6 +53,7 @@ def audit(
     as_json: Json = False,
 ) -> None:
     """Freeze the weights, drive on, drive elsewhere: how much of the plant does the model know?"""
+    require("plot", "dnnmso audit")
     from dnnmso_mj.audit.document import document
     from dnnmso_mj.audit.figure import audit_png
     from dnnmso_mj.audit.plan import AuditError, plan_audit

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dnnmso_mj.cli.shared import Json, listing, number, print_table, working
+from dnnmso_mj.extras import require
 
 if TYPE_CHECKING:
     from dnnmso_mj.bench.run import Benchmark
@@ -27,6 +28,7 @@ def bench(
     as_json: Json = False,
 ) -> None:
     """Time the controller, the loop, sweeps and logs side by side with others."""
+    require("sweep", "dnnmso bench")
     from dnnmso_mj.bench.run import run_bench
 
     done = run_bench(sections or (), quick=quick, working=working)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dnnmso_mj.cli.completing import complete_controllers
 from dnnmso_mj.cli.shared import (
     Force,
     Jobs,
@@ -25,6 +26,7 @@ from dnnmso_mj.cli.shared import (
     working,
 )
 from dnnmso_mj.cli.watching import run_watched
+from dnnmso_mj.extras import require
 
 if TYPE_CHECKING:
     from dnnmso_mj.comparison.pairing import Pairing
@@ -47,6 +49,7 @@ def compare(
         str,
         typer.Option(
             metavar="A,B,C",
+            autocompletion=complete_controllers,
             help="Shipped tuned controllers, kinds (their defaults), files; all against the first.",
         ),
     ],
@@ -60,6 +63,7 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Hold controllers against one another, seed by seed; one row a run to Parquet."""
+    require("sweep", "dnnmso compare")
     from dnnmso_mj.comparison.plan import default_out, parse_controllers, plan_comparison
     from dnnmso_mj.comparison.summary import summarise
     from dnnmso_mj.sweep.local import LocalEngine

@@ -8,14 +8,16 @@ from typing import Annotated
 
 import typer
 
-from dnnmso_mj.cli.shared import Json, Log, listing, number, print_table, working
+from dnnmso_mj.cli.shared import Json, Log, Logs, listing, number, print_table, working
+from dnnmso_mj.extras import require
 
 
 def plot(
-    logs: Annotated[list[Path], typer.Argument(help="One log, or several to compare.")],
+    logs: Logs,
     out: Annotated[Path | None, typer.Option(help="Folder; default beside the first log.")] = None,
 ) -> None:
-    """Draw the paper's figures and the theory from logs."""
+    """Draw the paper's figures and the theory from logs; several are compared."""
+    require("plot", "dnnmso plot")
     from dnnmso_mj.plots import save_comparison, save_figures
     from dnnmso_mj.reading import read_trace
 
@@ -35,29 +37,33 @@ def plot(
 
 
 def replay(
-    log: Log,
+    logs: Logs,
     save: Annotated[Path | None, typer.Option(help="Write a Rerun recording (.rrd).")] = None,
     screenshot: Annotated[Path | None, typer.Option(help="Write a picture (.png).")] = None,
     serve: Annotated[bool, typer.Option(help="Serve the web viewer on 127.0.0.1.")] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Of --serve.")] = 9090,
     at: Annotated[float | None, typer.Option(help="Time of --screenshot (s).")] = None,
-    tab: Annotated[str, typer.Option(help="Open tab of --save and --screenshot.")] = "Tracking",
+    tab: Annotated[str, typer.Option(help="The tab that is open at first.")] = "Tracking",
+    side_by_side: Annotated[
+        bool, typer.Option(help="The arms of several logs beside, not in one another.")
+    ] = False,
 ) -> None:
-    """Open a log in the Rerun viewer."""
+    """Open a log, or up to eight to compare, in the Rerun viewer."""
+    require("viewer", "dnnmso replay")
     from dnnmso_mj import replay as viewer
 
     if save is not None:
         with working("converting"):
-            viewer.save_rrd(log, save, tab)
+            viewer.save_rrd(logs, save, tab, side_by_side=side_by_side)
         print(save)
     if screenshot is not None:
         with working("drawing"):
-            viewer.screenshot(log, screenshot, t=at, tab=tab)
+            viewer.screenshot(logs, screenshot, t=at, tab=tab, side_by_side=side_by_side)
         print(screenshot)
     if serve:
-        viewer.serve(log, port)
+        viewer.serve(logs, port, tab, side_by_side=side_by_side)
     elif save is None and screenshot is None:
-        viewer.open_viewer(log)
+        viewer.open_viewer(logs, tab, side_by_side=side_by_side)
 
 
 def info(log: Log, as_json: Json = False) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dnnmso_mj.cli.completing import complete_controllers
 from dnnmso_mj.cli.shared import (
     Force,
     Jobs,
@@ -23,6 +24,7 @@ from dnnmso_mj.cli.shared import (
     working,
 )
 from dnnmso_mj.cli.watching import run_watched
+from dnnmso_mj.extras import require
 
 if TYPE_CHECKING:
     from dnnmso_mj.margins.cards import Margin, Ranking
@@ -37,7 +39,9 @@ def margins(
     controllers: Annotated[
         str,
         typer.Option(
-            metavar="A,B,C", help="Shipped tuned controllers, kinds (their defaults), files."
+            metavar="A,B,C",
+            autocompletion=complete_controllers,
+            help="Shipped tuned controllers, kinds (their defaults), files.",
         ),
     ],
     seeds: Annotated[str, typer.Option(metavar="START:STOP", help="Or a number, or a list.")],
@@ -60,6 +64,7 @@ def margins(
     as_json: Json = False,
 ) -> None:
     """Search how much of each imperfection controllers stand."""
+    require("sweep", "dnnmso margins")
     from dnnmso_mj.margins.cards import margins_of, rank
     from dnnmso_mj.margins.plan import plan_margins
     from dnnmso_mj.margins.rows import parse_rows

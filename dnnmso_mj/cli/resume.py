@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dnnmso_mj.cli.run import draw, print_summary
+from dnnmso_mj.cli.run import can_draw, draw, print_summary, tell
 from dnnmso_mj.cli.shared import (
     DIVERGED,
     Json,
@@ -46,12 +47,17 @@ def resume(
 ) -> None:
     """Go on from any tick of a log: bit for bit, or with something changed."""
     from dnnmso_mj.resume import resume as resume_log
+    from dnnmso_mj.run import LoggedRun
 
+    plot = plot and can_draw()
     sets = overrides or []
     try:
         with progress_bar(log.stem, None) as progress:
             done = resume_log(log, at, sets, out, force=force, trust=trust, progress=progress)
     except RunInterrupted as stop:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # all that is left is to say what was run
+        if stop.trace is not None and (stop.ticks or as_json):
+            tell(LoggedRun(stop.trace, stop.log), [], as_json=as_json, real_time=False)
         raise KeyboardInterrupt(f"log: {near(stop.log)} ({stop.ticks} ticks)") from stop
     figures, undrawn = draw(done.run) if plot else ([], None)
     _tell(done, log, sets, figures, as_json=as_json)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -10,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dnnmso_mj.cli.live import Port, Serve, View, live_view
 from dnnmso_mj.cli.shared import (
     DIVERGED,
     Json,
     Overrides,
+    ScenarioName,
     Trust,
     near,
     number,
@@ -21,7 +24,8 @@ from dnnmso_mj.cli.shared import (
     progress_bar,
     working,
 )
-from dnnmso_mj.errors import DnnmsoError, RunInterrupted, ScenarioError
+from dnnmso_mj.errors import DnnmsoError, MissingExtraError, RunInterrupted, ScenarioError
+from dnnmso_mj.extras import require
 
 if TYPE_CHECKING:
     from dnnmso_mj.run import LoggedRun
@@ -45,7 +49,7 @@ UNITS = {
 
 
 def run(
-    scenario: Annotated[str, typer.Argument(help="A scenario file, or the name of a shipped one.")],
+    scenario: ScenarioName,
     overrides: Overrides = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the initial weights.")] = None,
     out: Annotated[Path | None, typer.Option(help="The log; default logs/NAME.mcap.")] = None,
@@ -53,48 +57,51 @@ def run(
     real_time: Annotated[
         bool, typer.Option("--real-time", help="Keep to the wall clock, one tick each dt.")
     ] = False,
+    view: View = False,
+    serve: Serve = False,
+    port: Port = 9090,
     plot: Annotated[bool, typer.Option(help="Draw the figures beside the log.")] = True,
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:
-    """Run a scenario headless: log, figures, summary."""
+    """Run a scenario: log, figures, summary."""
     from dnnmso_mj.loading import load_scenario, located
-    from dnnmso_mj.run import run_logged
-    from dnnmso_mj.timing import timing
+    from dnnmso_mj.run import LoggedRun, run_logged
 
+    plot = plot and can_draw()
     sets = [*(overrides or []), *([] if seed is None else [f"seed={seed}"])]
     loaded = load_scenario(scenario, sets, trust=trust)
-    try:
-        with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
-            done = run_logged(loaded, out, force=force, real_time=real_time, progress=progress)
-    except ScenarioError as error:
-        raise located(error, scenario, sets) from error
-    except RunInterrupted as stop:
-        ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
-        raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
-    figures, undrawn = draw(done) if plot else ([], None)
-    info = done.trace.info
-    if as_json:
-        print(json.dumps({
-            "status": info.status,
-            "reason": info.reason,
-            "scenario": loaded.name,
-            "log": str(done.log),
-            "figures": [str(figure) for figure in figures],
-            "seed": info.seed,
-            "wall_s": info.wall_s,
-            "metrics": dict(info.metrics),
-            **({"real_time": asdict(timing(done.trace))} if real_time else {}),
-        }))  # fmt: skip
-    else:
-        print_summary(done.trace, done.log, figures)
-        if real_time:
-            _print_timing(timing(done.trace))
+    with live_view(view, serve, port) as live:
+        try:
+            with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
+                done = run_logged(
+                    loaded, out, force=force, real_time=real_time, progress=progress, live=live
+                )
+        except ScenarioError as error:
+            raise located(error, scenario, sets) from error
+        except RunInterrupted as stop:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # all that is left is to say what was run
+            if stop.trace is not None and (stop.ticks or as_json):
+                tell(LoggedRun(stop.trace, stop.log), [], as_json=as_json, real_time=real_time)
+            ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
+            raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
+        figures, undrawn = draw(done) if plot else ([], None)
+        tell(done, figures, as_json=as_json, real_time=real_time)
     if undrawn is not None:
         raise undrawn
-    if info.status == "diverged":
-        print(f"diverged: {info.reason}", file=sys.stderr)
+    if done.trace.info.status == "diverged":
+        print(f"diverged: {done.trace.info.reason}", file=sys.stderr)
         raise typer.Exit(DIVERGED)
+
+
+def can_draw() -> bool:
+    """Whether figures can be drawn; says so if not, since a run is worth having without them."""
+    try:
+        require("plot", "figures: drawing them")
+    except MissingExtraError as error:
+        print(f"no {error} (--no-plot: without this line)", file=sys.stderr)
+        return False
+    return True
 
 
 def draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
@@ -110,6 +117,29 @@ def draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
         return [], error
 
 
+def tell(done: LoggedRun, figures: list[Path], *, as_json: bool, real_time: bool) -> None:
+    """A run's summary, as a table or as one JSON object."""
+    from dnnmso_mj.timing import timing
+
+    info = done.trace.info
+    if as_json:
+        print(json.dumps({
+            "status": info.status,
+            "reason": info.reason,
+            "scenario": done.trace.scenario.name,
+            "log": str(done.log),
+            "figures": [str(figure) for figure in figures],
+            "seed": info.seed,
+            "wall_s": info.wall_s,
+            "metrics": dict(info.metrics),
+            **({"real_time": asdict(timing(done.trace))} if real_time else {}),
+        }))  # fmt: skip
+    else:
+        print_summary(done.trace, done.log, figures)
+        if real_time:
+            _print_timing(timing(done.trace))
+
+
 def print_summary(trace: Trace, log: Path, figures: list[Path], since: int = 0) -> None:
     """Metrics, speed and files of a run, of which the ticks from `since` on were simulated now."""
     from rich.table import Table
@@ -123,7 +153,8 @@ def print_summary(trace: Trace, log: Path, figures: list[Path], since: int = 0) 
         table.add_row(name, number(value), UNITS.get(name, ""))
     print_table(table, soft_wrap=True)
     simulated = (len(trace) - since) * trace.scenario.dt
-    print(f"{simulated:g} s simulated in {info.wall_s:.2f} s")
+    whole = f" of {trace.scenario.duration:g} s" if info.status == "interrupted" else ""
+    print(f"{simulated:g} s{whole} simulated in {info.wall_s:.2f} s")
     print(f"log      {near(log)}")
     for figure in figures:
         print(f"figure   {near(figure)}")

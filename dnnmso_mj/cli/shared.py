@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from dnnmso_mj.cli.completing import complete_log, complete_scenario, complete_set
+from dnnmso_mj.paths import find_log
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -19,15 +24,44 @@ if TYPE_CHECKING:
 DIVERGED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
+UNLIMITED = 10_000  # columns
+LABELS = {"error": "bold red", "warning": "bold yellow"}
 
-Log = Annotated[Path, typer.Argument(help="A log that `dnnmso run` wrote (.mcap).")]
-ScenarioName = Annotated[str, typer.Argument(help="A scenario file, or the name of a shipped one.")]
+Log = Annotated[
+    Path,
+    typer.Argument(
+        metavar="LOG",
+        parser=find_log,
+        autocompletion=complete_log,
+        help="A log (.mcap), the name of one in logs, or last.",
+    ),
+]
+Logs = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="LOG...",
+        parser=find_log,
+        autocompletion=complete_log,
+        help="Logs (.mcap), names of some in logs, or last.",
+    ),
+]
+ScenarioName = Annotated[
+    str,
+    typer.Argument(
+        autocompletion=complete_scenario, help="A scenario file, or the name of a shipped one."
+    ),
+]
 Jobs = Annotated[int | None, typer.Option(min=1, help="Runs at once; default all cores.")]
 Resume = Annotated[bool, typer.Option(help="Go on from what is there.")]
 Force = Annotated[bool, typer.Option(help="Start anew whatever is there.")]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change a key, e.g. plant.gravity=1.62."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        autocompletion=complete_set,
+        help="Change a key, e.g. plant.gravity=1.62.",
+    ),
 ]
 Trust = Annotated[
     bool, typer.Option("--trust", help="Run code that the scenario names (keys `python`).")
@@ -62,11 +96,32 @@ def progress_bar(name: str, total: int | None) -> Iterator[Progress]:
         yield lambda done: bar.advance(task, done)
 
 
-def print_table(table: Table, soft_wrap: bool = False) -> None:
-    """Print a table on standard output, square brackets as they are."""
+def print_table(table: Table, soft_wrap: bool = False, *, wide: bool = False) -> None:
+    """Print a table on standard output, square brackets as they are.
+
+    Args:
+        table: what is printed.
+        soft_wrap: whether a terminal breaks lines that are too long.
+        wide: whether lines may be of any length where there is no terminal.
+    """
     from rich.console import Console
 
-    Console(markup=False, soft_wrap=soft_wrap).print(table)
+    console = Console(markup=False, soft_wrap=soft_wrap)
+    if wide and not sys.stdout.isatty():
+        console.width = UNLIMITED
+    console.print(table)
+
+
+def say(label: str, text: str) -> None:
+    """Print "label: text" on standard error, the label in colour on a terminal."""
+    if not (sys.stderr.isatty() or "FORCE_COLOR" in os.environ):
+        print(f"{label}: {text}", file=sys.stderr)
+        return
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console.print(Text.assemble((label, LABELS[label]), f": {text}"))
 
 
 def near(path: Path) -> Path:

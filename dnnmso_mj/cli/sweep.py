@@ -24,6 +24,7 @@ from dnnmso_mj.cli.shared import (
     working,
 )
 from dnnmso_mj.cli.watching import run_watched
+from dnnmso_mj.extras import require
 
 if TYPE_CHECKING:
     from dnnmso_mj.sweep.plan import Plan
@@ -57,6 +58,7 @@ def sweep(
     as_json: Json = False,
 ) -> None:
     """Run many seeds and parameters; one row a run to Parquet."""
+    require("ray" if engine == "ray" else "sweep", "dnnmso sweep")
     from dnnmso_mj.sweep.plan import parse_seeds, plan_sweep
     from dnnmso_mj.sweep.run import default_out, make_engine, run_sweep
     from dnnmso_mj.sweep.summary import summarise

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dnnmso_mj.cli.completing import complete_controller
 from dnnmso_mj.cli.shared import (
     Force,
     Jobs,
@@ -27,6 +28,7 @@ from dnnmso_mj.cli.shared import (
     print_table,
 )
 from dnnmso_mj.cli.watching import LINE_PERIOD, how_to_go_on, terminated_like_ctrl_c
+from dnnmso_mj.extras import require
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -39,7 +41,11 @@ def tune(
     scenario: ScenarioName,
     controller: Annotated[
         str,
-        typer.Option(metavar="KIND_OR_FILE", help="What is tuned, and where the search starts."),
+        typer.Option(
+            metavar="KIND_OR_FILE",
+            autocompletion=complete_controller,
+            help="What is tuned, and where the search starts.",
+        ),
     ],
     trials: Annotated[int, typer.Option(min=1, help="The budget; the first is the untuned one.")],
     seeds: Annotated[str, typer.Option(metavar="START:STOP", help="The runs of every trial.")],
@@ -63,6 +69,7 @@ def tune(
     as_json: Json = False,
 ) -> None:
     """Search for a controller's best settings; the winner is a file for `controller: {from: …}`."""
+    require("tune", "dnnmso tune")
     from dnnmso_mj.sweep.plan import parse_seeds
     from dnnmso_mj.tuning import TuneInterrupted
     from dnnmso_mj.tuning.objective import Objective

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading.complaints import Complaint, complain, explain
 from dnnmso_mj.loading.overrides import Override, apply_overrides, parse_overrides
+from dnnmso_mj.loading.pinning import pin_policy
 from dnnmso_mj.loading.places import Places
 from dnnmso_mj.loading.shape import lookup
 from dnnmso_mj.loading.trust import PROBLEM, import_paths, require_trust
@@ -20,6 +21,7 @@ from dnnmso_mj.paths import find_model, model_name
 from dnnmso_mj.scenario import Scenario
 
 MODEL = ("plant", "model")
+POLICY_FILE = ("controller", "file")
 # What a run that has begun cannot have otherwise, and why.
 SETTLED = {
     "dt": "the ticks before have another; allowed: what they have",
@@ -54,6 +56,7 @@ def change_scenario(
         complain((key,), data, why) for key, why in SETTLED.items() if data[key] != settled[key]
     ]
     complaints += begun or _resolve_model(data, sets)
+    _pin(data, sets)
     if not trust:
         complaints += [complain(path, data, PROBLEM) for path, _ in import_paths(data)]
     try:
@@ -75,6 +78,13 @@ def _resolve_model(data: dict[str, Any], sets: Sequence[Override]) -> list[Compl
     except ScenarioError as error:
         return [complain(MODEL, data, str(error))]
     return []
+
+
+def _pin(data: dict[str, Any], sets: Sequence[Override]) -> None:
+    """Another policy file has another checksum."""
+    if any(item.path == POLICY_FILE for item in sets) and isinstance(data["controller"], dict):
+        data["controller"].pop("sha256", None)
+    pin_policy(data)
 
 
 def _place(places: Places, complaint: Complaint) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dnnmso_mj.errors import DnnmsoError
+from dnnmso_mj.files import write_whole
 from dnnmso_mj.report.page import Section, render
 from dnnmso_mj.wording import clean
 
@@ -39,13 +39,9 @@ def write_report(files: Sequence[Path], out: Path) -> None:
     page = report_page(files, out.name).encode("utf-8", errors="backslashreplace")
     if any(file.exists() and out.exists() and file.samefile(out) for file in files):
         raise ReportError(f"--out {clean(str(out))}: is one of the files; allowed: another --out")
-    unfinished = out.with_name(f".{out.name}.{os.getpid()}.part")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        unfinished.write_bytes(page)
-        unfinished.replace(out)
+        write_whole(out, page)
     except OSError as error:
-        unfinished.unlink(missing_ok=True)
         raise ReportError(f"{clean(str(out))}: cannot be written: {error.strerror}") from error
 
 

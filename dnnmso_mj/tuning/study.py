@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self
 
 from dnnmso_mj.errors import MissingExtraError
+from dnnmso_mj.extras import pip_install
 from dnnmso_mj.sweep.journal import differences
 from dnnmso_mj.tuning import TuneError
 from dnnmso_mj.tuning.spaces import Space
@@ -188,7 +189,7 @@ def import_optuna() -> ModuleType:
         import optuna
     except ImportError as error:
         raise MissingExtraError(
-            "Optuna is not installed; allowed: pip install 'dnnmso_mj[tune]'"
+            f"dnnmso tune needs optuna, which is not installed: {pip_install('tune')}"
         ) from error
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     module: ModuleType = optuna

@@ -1,129 +1,154 @@
-"""A run as a Rerun recording: the moving arm, every plot's lines, the events and a summary."""
+"""Runs as the content of a Rerun file, with the layout to see them in."""
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-import numpy as np
 import rerun as rr
 
 from dnnmso_mj.errors import LogError
+from dnnmso_mj.log.segments import Segment
+from dnnmso_mj.reading import Snapshot
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.trace import Array, Event, Trace
-from dnnmso_mj.viewer.arm_picture import send_arms, stage
-from dnnmso_mj.viewer.blueprint import EVENTS, PLOTS, SUMMARY, replay_blueprint
-from dnnmso_mj.viewer.signals import THIN, TIMELINE, Plot, plot_tabs
+from dnnmso_mj.trace import StepLayout, Trace
+from dnnmso_mj.viewer.arm_picture import stage
+from dnnmso_mj.viewer.blueprint import SUMMARY, check_tab, replay_blueprint
+from dnnmso_mj.viewer.look import RUN_COLORS, Look, Point
+from dnnmso_mj.viewer.stream import RunStream
+from dnnmso_mj.viewer.summary import comparison
 
 APPLICATION = "dnnmso"
-TICKS = "tick"
-POSE_PERIOD = 0.01  # s, at least, between two poses of the arm: eyes need no more
-# Tried out: these and no others are known to be in the viewer's font.
-_NOT_DRAWN = re.compile("[^\n -\u0148\u014a-\u017f\u0300-\u03de–—‘’“”…−‖⁻¹₀₁₂₃→⇒≤≥√∞≈≠∑∫]")
-_PIXEL = {
-    "extremes": rr.components.AggregationPolicy.MinMax,
-    "largest": rr.components.AggregationPolicy.Max,
-}
-_LEVELS = {
-    "info": rr.TextLogLevel.INFO,
-    "warning": rr.TextLogLevel.WARN,
-    "error": rr.TextLogLevel.ERROR,
-}
+MOST_RUNS = len(RUN_COLORS)
 
 
-def rrd_bytes(trace: Trace, scene: Scene, first_tab: str = "Tracking") -> bytes:
-    """The content of a .rrd file: a run, and the layout to see it in.
-
-    Every tick of every line that a plot shows is in it; the arm at most every 10 ms. It is made in
-    memory, since Rerun's own writer waits for ever on a full disk.
+@dataclass(frozen=True)
+class Run:
+    """A run to show, of at least one tick.
 
     Args:
-        trace: the run, of at least one tick.
-        scene: the robot it is a run of.
+        name: tells it from others beside it.
+        trace: its columns.
+        scene: its robot.
+        snapshots: of its controller.
+        segments: which scenario was in force when, where that has changed.
+    """
+
+    name: str
+    trace: Trace
+    scene: Scene
+    snapshots: Sequence[Snapshot] = ()
+    segments: Sequence[Segment] = ()
+
+
+def rrd_bytes(
+    runs: Sequence[Run], first_tab: str = "Tracking", *, side_by_side: bool = False
+) -> bytes:
+    """The content of a .rrd file: a run or several, and the layout to see them in.
+
+    It is made in memory, since Rerun's own writer waits for ever on a full disk.
+
+    Args:
+        runs: one; or up to eight of robots with as many joints, each then in one colour.
         first_tab: the tab that is open at first, a key of `signals.plot_tabs`.
+        side_by_side: whether the arms stand beside one another, and not in one another.
 
     Raises:
-        LogError: there is no such tab.
+        LogError: there is no such tab, or the runs cannot be shown together.
     """
-    tabs = plot_tabs(trace)
-    if first_tab not in tabs:
-        raise LogError(f"tab {first_tab!r}; this run has: {', '.join(tabs)}")
-    stride = max(1, math.ceil(POSE_PERIOD / trace.scenario.dt - 1e-9))
-    ticks = np.arange(0, len(trace), stride)
-    q, q_ref = trace["q"][ticks], trace["q_ref"][ticks]
-    centre, half_size = stage(scene, q, q_ref)
-    has_events = bool(trace.events)
-    layout = replay_blueprint(tabs, centre, half_size, events=has_events, first_tab=first_tab)
     recording = rr.RecordingStream(APPLICATION)
     memory = recording.memory_recording()
-    recording.send_blueprint(layout)  # active at once: served, a mere default is lost at times
-    recording.send_recording_name(f"{trace.scenario.name}, seed {trace.info.seed}")
-    recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    send_arms(recording, scene, _times(trace["t"][ticks], ticks), q, q_ref)
-    for plot in (plot for plots in tabs.values() for plot in plots):
-        _send_plot(recording, plot, trace["t"])
-    if trace.events:
-        _send_events(recording, trace.events, trace.scenario.dt)
-    summary = rr.TextDocument(_summary(trace), media_type=rr.MediaType.MARKDOWN)
-    recording.log(SUMMARY, summary, static=True)
+    if len(runs) == 1:
+        stream = _stream(recording, runs[0], "", Look())
+        stream.begin(first_tab)
+        _send(stream, runs[0])
+    else:
+        _send_together(recording, runs, first_tab, side_by_side)
     return memory.drain_as_bytes()
 
 
-def _send_plot(recording: rr.RecordingStream, plot: Plot, t: Array) -> None:
-    """The lines of a plot as one entity, a column each; its levels as another, of two points."""
-    path = f"{PLOTS}/{plot.path}"
-    style = rr.SeriesLines(
-        names=[line.name for line in plot.lines],
-        colors=[line.color for line in plot.lines],
-        widths=[line.width for line in plot.lines],
-        aggregation_policy=_PIXEL[plot.pixel],
-    )
-    recording.log(f"{path}/lines", style, static=True)
-    values = np.stack([line.values for line in plot.lines], axis=1)  # (N, lines)
-    _send_scalars(recording, f"{path}/lines", _times(t, np.arange(len(t))), values)
-    if not plot.levels:
-        return
-    style = rr.SeriesLines(
-        names=[level.name for level in plot.levels],
-        colors=[level.color for level in plot.levels],
-        widths=[THIN] * len(plot.levels),
-    )
-    recording.log(f"{path}/levels", style, static=True)
-    ends = np.array([0, len(t) - 1])
-    levels = np.array([[level.value for level in plot.levels]] * 2)  # (2, levels)
-    _send_scalars(recording, f"{path}/levels", _times(t[ends], ends), levels)
+def _stream(recording: rr.RecordingStream, run: Run, prefix: str, look: Look) -> RunStream:
+    trace = run.trace
+    layout = StepLayout(trace.n_joints, trace.n_layers)
+    return RunStream(recording, trace.scenario, run.scene, layout, prefix=prefix, look=look)
 
 
-def _send_scalars(
-    recording: rr.RecordingStream, path: str, times: Sequence[rr.TimeColumn], values: Array
+def _send(stream: RunStream, run: Run) -> None:
+    """A whole run that has begun."""
+    trace = run.trace
+    segments = run.segments or [Segment(0, trace.scenario)]
+    ends = [*(segment.first for segment in segments[1:]), len(trace)]
+    for segment, end in zip(segments, ends, strict=True):
+        columns = {name: trace[name][segment.first : end] for name in trace}
+        stream.send(replace(trace, columns=columns, scenario=segment.scenario))
+    stream.events(trace.events)
+    for snapshot in run.snapshots:
+        stream.snapshot(snapshot.t, snapshot.arrays)
+    stream.end(trace.info)
+
+
+def _send_together(
+    recording: rr.RecordingStream, runs: Sequence[Run], first_tab: str, side_by_side: bool
 ) -> None:
-    columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
-    recording.send_columns(path, times, columns)
-
-
-def _send_events(recording: rr.RecordingStream, events: Sequence[Event], dt: float) -> None:
-    t = np.array([event.t for event in events])
-    texts = [_drawable(f"{event.t:.3f} s: {event.message}") for event in events]
-    columns = rr.TextLog.columns(text=texts, level=[_LEVELS[event.level] for event in events])
-    recording.send_columns(EVENTS, _times(t, np.round(t / dt).astype(int)), columns)
-
-
-def _times(t: Array, ticks: Array) -> list[rr.TimeColumn]:
-    return [rr.TimeColumn(TIMELINE, duration=t), rr.TimeColumn(TICKS, sequence=ticks)]
-
-
-def _summary(trace: Trace) -> str:
-    """How the run went, in Markdown."""
-    info, scenario = trace.info, trace.scenario
-    outcome = f"{info.status}: {info.reason}" if info.reason else info.status
-    title = f"**{scenario.name}**, seed {info.seed}, {len(trace) * scenario.dt:g} s: {outcome}"
-    metrics = [
-        f"- {name}: {value:.4g}" for name, value in info.metrics.items() if value is not None
+    _check(runs)
+    looks = _looks(runs, side_by_side)
+    streams = [
+        _stream(recording, run, f"{rr.escape_entity_path_part(run.name)}/", look)
+        for run, look in zip(runs, looks, strict=True)
     ]
-    return _drawable("\n\n".join(filter(None, [title, scenario.description, "\n".join(metrics)])))
+    shown = [stream.shown for stream in streams]
+    for k, run in enumerate(runs[1:], start=1):
+        if _same_events(run, runs[0]):
+            shown[k] = replace(shown[k], lanes=shown[k].lanes[:1])
+    check_tab(first_tab, shown)
+    recording.send_blueprint(replay_blueprint(shown, first_tab))
+    recording.send_recording_name(", ".join(run.name for run in runs))
+    text = comparison([run.name for run in runs], [run.trace for run in runs])
+    document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+    recording.log(SUMMARY, document, static=True)
+    for stream, run in zip(streams, runs, strict=True):
+        stream.declare()
+        _send(stream, run)
 
 
-def _drawable(text: str) -> str:
-    """Text without the characters that would end a headless viewer; see `signals`."""
-    return _NOT_DRAWN.sub("?", text)
+def _check(runs: Sequence[Run]) -> None:
+    if len(runs) > MOST_RUNS:
+        raise LogError(f"{len(runs)} logs; allowed: up to {MOST_RUNS} in one viewer")
+    first = runs[0]
+    for run in runs:
+        n = run.trace.n_joints
+        if n != first.trace.n_joints:
+            raise LogError(
+                f"{run.name} has {n} joints; allowed: {first.trace.n_joints}, as many as "
+                f"{first.name}. Replay them one at a time."
+            )
+
+
+def _looks(runs: Sequence[Run], side_by_side: bool) -> list[Look]:
+    """A colour for each run; the desired motion once for all that have the same."""
+    looks = []
+    for k, run in enumerate(runs):
+        is_new = not any(_same_motion(run, other) for other in runs[:k])
+        offset = _offset(k, runs) if side_by_side else (0.0, 0.0, 0.0)
+        ghost = is_new or side_by_side
+        looks.append(Look(run.name, RUN_COLORS[k], shared=is_new, ghost=ghost, offset=offset))
+    return looks
+
+
+def _offset(k: int, runs: Sequence[Run]) -> Point:
+    """Where arm k stands (m): in rows of up to four, as seen by the camera."""
+    apart = 2.0 * max(stage(run.trace.scenario, run.scene)[1] for run in runs)
+    abreast = min(len(runs), 4)
+    return (k % abreast) * apart, 0.0, -(k // abreast) * apart
+
+
+def _same_motion(run: Run, other: Run) -> bool:
+    """Whether two arms are alike and have the same way to go."""
+    a, b = run.trace.scenario, other.trace.scenario
+    alike = (a.plant.model, a.plant.lengths) == (b.plant.model, b.plant.lengths)
+    return alike and (a.reference, a.duration) == (b.reference, b.duration)
+
+
+def _same_events(run: Run, other: Run) -> bool:
+    a, b = run.trace.scenario, other.trace.scenario
+    return (a.events, a.dt) == (b.events, b.dt)

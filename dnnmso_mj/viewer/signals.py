@@ -1,6 +1,6 @@
-"""What a replay plots: the columns of a trace as titled plots of named, coloured lines.
+"""What a replay plots, tab by tab: decided by the scenario and the widths of its columns alone.
 
-What the viewer shows beside the arm is decided here, once: `dnnmso_mj.viewer.rrd` writes the lines,
+So it is the same for a run that is still going on. `dnnmso_mj.viewer.stream` writes the lines,
 `dnnmso_mj.viewer.blueprint` lays out the plots, and neither knows what they mean.
 
 The viewer's font has Latin, Greek, ² and ₁₀, but few combining accents; a headless viewer ends at a
@@ -9,265 +9,281 @@ character that it has not (ᵀ, for one).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from dnnmso_mj.scenario import ClassicalMso, DnnMso, Madam, expand
-from dnnmso_mj.trace import Array, Trace
-
-Rgb = tuple[int, int, int]
-Corner = Literal["LeftTop", "LeftBottom", "RightTop", "RightBottom"]
-
-TIMELINE = "time"  # what every line, pose and event is placed on: simulated time
-JOINT_COLORS: tuple[Rgb, ...] = (
-    (66, 150, 250),
-    (255, 150, 50),
-    (80, 200, 130),
-    (240, 90, 110),
-    (180, 140, 245),
-    (230, 200, 80),
-    (80, 200, 210),
+from dnnmso_mj.scenario import (
+    ClassicalMso,
+    ConcurrentLearning,
+    DnnMso,
+    External,
+    Imperfections,
+    LewisNn,
+    Madam,
+    RbfMso,
+    Scenario,
+    SlotineLi,
+    expand,
 )
-WHITE: Rgb = (235, 235, 235)
-GREY: Rgb = (150, 150, 150)
-RED: Rgb = (235, 70, 70)
-_FIRST_LAYER, _LAST_LAYER = np.array([240, 110, 210]), np.array([250, 230, 90])
-THIN, NORMAL, BROAD = 1.0, 1.5, 4.0  # points; a broad line is seen on both sides of one over it
+from dnnmso_mj.scenario.controller import inversion
+from dnnmso_mj.scene import Scene
+from dnnmso_mj.theory import UNDEFINED, build_bounds
+from dnnmso_mj.trace import Array, StepLayout, Trace
+from dnnmso_mj.viewer.plot import (
+    BROAD,
+    GREY,
+    RED,
+    THIN,
+    WHITE,
+    Level,
+    Line,
+    Plot,
+    difference,
+    distance,
+    entry,
+    joint_color,
+    joints,
+    layers,
+    log10,
+    log_plot,
+    pale,
+    scalar,
+)
+
+_HALVES = (("acceleration", "accelerations", "rad/s²"), ("velocity", "velocities", "rad/s"))
 
 
-@dataclass(frozen=True)
-class Line:
-    """One value a tick, shape (N,); a NaN leaves a gap."""
-
-    name: str
-    values: Array
-    color: Rgb
-    width: float = NORMAL
-
-
-@dataclass(frozen=True)
-class Level:
-    """A value that holds for the whole run, such as a limit."""
-
-    name: str
-    value: float
-    color: Rgb
-
-
-@dataclass(frozen=True)
-class Plot:
-    """Lines drawn over one another, the first at the bottom; `path` is unique among all plots."""
-
-    path: str
-    title: str
-    lines: tuple[Line, ...]
-    levels: tuple[Level, ...] = ()
-    y_range: tuple[float, float] | None = None  # None: whatever the lines need
-    # What a pixel shows of the many ticks that fall on it. Of a logarithm the low peaks are mere
-    # zero crossings. Never the mean: it would hide the peaks of torque and of compute time.
-    pixel: Literal["extremes", "largest"] = "extremes"
-    legend: Corner = "RightTop"  # where the lines seldom are
-
-
-def joint_color(joint: int) -> Rgb:
-    """The colour of a joint (from 0), the same in every plot and on the arm."""
-    return JOINT_COLORS[joint % len(JOINT_COLORS)]
-
-
-def plot_tabs(trace: Trace) -> dict[str, list[Plot]]:
-    """Tab name -> its plots; those of a network only for a run that has one.
+def plot_tabs(scenario: Scenario, scene: Scene, layout: StepLayout) -> dict[str, list[Plot]]:
+    """Tab name -> its plots; Learning only for a controller that learns the dynamics.
 
     Args:
-        trace: a run of at least one tick.
+        scenario: the experiment.
+        scene: the robot.
+        layout: the widths of the run's columns.
     """
-    network = {"Learning": _learning(trace)} if trace.n_layers else {}
+    learning = {"Learning": _learning(scenario, layout)} if learns(scenario, layout) else {}
     return {
-        "Tracking": _tracking(trace),
-        "Motion": _motion(trace),
-        **network,
-        "Theory": [*(_network_theory(trace) if network else []), *_loop_theory(trace)],
-        "Timing": _timing(trace),
+        "Tracking": _tracking(scenario),
+        **learning,
+        "Theory": [*_network_theory(scenario, layout), *_loop_theory(scenario)],
+        "Timing": _timing(scenario),
+        "Scene": [_tip(scene)],
     }
 
 
-def _tracking(trace: Trace) -> list[Plot]:
-    error = _joints("|e{}|", _log10(trace["q"] - trace["q_ref"]))
-    torque = _joints("τ{}", trace["tau"])
-    if not np.array_equal(trace["tau_cmd"], trace["tau"]):
-        torque = (*_pale("τ{} commanded", trace["tau_cmd"]), *torque)
+def learns(scenario: Scenario, layout: StepLayout) -> bool:
+    """Whether a controller's f̂ comes of what it has seen, as far as is known."""
+    adaptive = RbfMso | LewisNn | SlotineLi | ConcurrentLearning | External
+    return layout.n_layers > 0 or isinstance(scenario.controller, adaptive)
+
+
+def _tracking(scenario: Scenario) -> list[Plot]:
+    n = scenario.n_joints
+    torque = joints("τ{}", n, partial(entry, "tau"))
+    if _drives_err(scenario.imperfections):
+        torque = (*pale(joints("commanded", n, partial(entry, "tau_cmd"))), *torque)
+    limits = _torque_limits(scenario)
+    most = 1.25 * max((level.value for level in limits), default=0.0)
+    error, velocity_error = partial(difference, "q", "q_ref"), partial(difference, "qd", "qd_ref")
     return [
-        Plot("joint_angles", "Joint angles (rad)", _against_reference(trace, "q")),
-        _log_plot("error_log", "Tracking error |q − q_ref| (log₁₀ of rad)", error),
-        Plot("torque", "Torque (N·m)", torque, _torque_limits(trace), legend="RightBottom"),
-    ]
-
-
-def _motion(trace: Trace) -> list[Plot]:
-    angle = _joints("e{}", trace["q"] - trace["q_ref"])
-    velocity = _joints("ė{}", trace["qd"] - trace["qd_ref"])
-    return [
-        Plot("velocities", "Joint velocities (rad/s)", _against_reference(trace, "qd")),
-        Plot("error", "Tracking error q − q_ref (rad)", angle),
-        Plot("velocity_error", "Velocity error q̇ − q̇_ref (rad/s)", velocity),
-    ]
-
-
-def _learning(trace: Trace) -> list[Plot]:
-    n, e_obs = trace.n_joints, trace["e_obs"]
-    ratio = _layers(_log10(trace["update_ratio"]))
-    return [
-        *(_learned_row(trace, row) for row in range(2 * n)),
-        Plot("observer_angle", "Observer error, angles (rad)", _joints("q{}", e_obs[:, :n])),
         Plot(
-            "observer_velocity", "Observer error, velocities (rad/s)", _joints("q̇{}", e_obs[:, n:])
+            "joint_angles",
+            "Joint angles (rad)",
+            _against_reference(scenario, "q"),
+            legend="RightTop",
         ),
-        Plot("weight_norm", "Weight norm ‖W‖", _layers(trace["weight_norm"])),
-        _log_plot("update_ratio", "Update ratio ‖ΔW‖/‖W‖ (log₁₀)", ratio),
+        Plot("velocities", "Joint velocities (rad/s)", _against_reference(scenario, "qd")),
+        log_plot("error_log", "Tracking error |q − q_ref| (log₁₀ of rad)", _errors(n)),
+        Plot("error", "Tracking error q − q_ref (rad)", joints("e{}", n, error)),
+        Plot(
+            "torque",
+            "Torque (N·m)",
+            torque,
+            limits,
+            y_range=(-most, most) if limits else None,  # what is commanded may be far beyond
+            legend="RightBottom",
+        ),
+        Plot(
+            "velocity_error",
+            "Velocity error q̇ − q̇_ref (rad/s)",
+            joints("ė{}", n, velocity_error),
+        ),
     ]
 
 
-def _learned_row(trace: Trace, row: int) -> Plot:
-    n = trace.n_joints
-    color, unit = joint_color(row % n), "rad/s" if row < n else "rad/s²"
-    lines = (
-        Line("f true", trace["f_true"][:, row], _lighter(color), BROAD),
-        Line("f learned", trace["f_hat"][:, row], color),
-    )
-    return Plot(f"dynamics_{row + 1}", f"Dynamics f, row {row + 1} of {2 * n} ({unit})", lines)
+def _learning(scenario: Scenario, layout: StepLayout) -> list[Plot]:
+    n = scenario.n_joints
+    halves = list(zip(_HALVES, (slice(n, 2 * n), slice(0, n)), strict=True))
+    if not _learns_velocities(scenario):
+        del halves[1]
+    plots = [_dynamics(f"dynamics_{path}", what, unit, rows) for (path, what, unit), rows in halves]
+    f_err = [
+        Line(f"{what} ({unit})", log10(distance("f_true", "f_hat", rows)), color, place=place)
+        for ((_, what, unit), rows), color, place in zip(
+            halves, (WHITE, GREY), (0, 1), strict=False
+        )
+    ]
+    title = "Knowledge error: distance of f true and learned (log₁₀)"
+    plots.append(log_plot("knowledge", title, tuple(f_err), legend="RightTop"))
+    if hasattr(scenario.controller, "observer"):
+        angles = joints("angles", n, lambda j: log10(entry("e_obs", j)))
+        velocities = joints("velocities", n, lambda j: log10(entry("e_obs", n + j)))
+        title = "Observer error |x − x̂| (log₁₀ of rad, rad/s)"
+        lines = (*pale(angles), *velocities)
+        plots.append(log_plot("observer", title, lines, legend="RightTop"))
+    if layout.n_layers:
+        norms = layers(layout.n_layers, partial(entry, "weight_norm"))
+        ratios = layers(layout.n_layers, lambda k: log10(entry("update_ratio", k)))
+        plots.append(Plot("weight_norm", "Weight norm ‖W‖", norms, legend="RightTop"))
+        plots.append(log_plot("update_ratio", "Update ratio ‖ΔW‖/‖W‖ (log₁₀)", ratios))
+    return plots
 
 
-def _network_theory(trace: Trace) -> list[Plot]:
-    controller = trace.scenario.controller
+def _learns_velocities(scenario: Scenario) -> bool:
+    """Whether the upper rows of f, the velocities, are learned, and not taken as measured."""
+    controller = scenario.controller
+    outputs = getattr(getattr(controller, "network", None), "outputs", "kinematic")
+    return outputs == "full" and not isinstance(controller, ClassicalMso)
+
+
+def _dynamics(path: str, what: str, unit: str, rows: slice) -> Plot:
+    """The true rows of f, and the learned ones over them."""
+    n, first = rows.stop - rows.start, rows.start
+    true = joints("true", n, lambda j: entry("f_true", first + j))
+    learned = joints("learned", n, lambda j: entry("f_hat", first + j))
+    title = f"Dynamics f, true and learned: {what} ({unit})"
+    return Plot(path, title, (*pale(true), *learned), legend="RightTop")
+
+
+def _network_theory(scenario: Scenario, layout: StepLayout) -> list[Plot]:
+    if not layout.n_layers:
+        return []
+    controller = scenario.controller
     eta: tuple[Level, ...] = ()
     if isinstance(controller, DnnMso | ClassicalMso) and isinstance(controller.rule, Madam):
         eta = (Level("η in use", controller.madam.eta, WHITE),)
     trust = (
-        Line("deep relative trust", _log10(trace["drt_bound"]), WHITE, BROAD),
-        *_layers(_log10(trace["gradient_change"])),
+        Line("deep relative trust", log10(scalar("drt_bound")), WHITE, BROAD, role="context"),
+        *layers(layout.n_layers, lambda k: log10(entry("gradient_change", k))),
     )
     return [
         Plot(
             "theorem_1",
             "Theorem 1: what η must be below",
-            _layers(trace["eta_bound"]),
+            layers(layout.n_layers, partial(entry, "eta_bound")),
             eta,
-            legend="RightBottom",
+            legend="RightTop",
         ),
-        _log_plot("relative_trust", "Relative change of the gradient (log₁₀)", trust),
+        log_plot("relative_trust", "Relative change of the gradient (log₁₀)", trust, "RightTop"),
     ]
 
 
-def _loop_theory(trace: Trace) -> list[Plot]:
-    lyapunov = Line("L", _log10(trace["lyapunov"]), WHITE)
-    bounds = [
-        Line(name, _log10(trace[column]), color)
-        for name, column, color in (
-            ("bound on |e|", "ultimate_bound", WHITE),
-            ("paper's, on ‖e_r‖", "ultimate_bound_paper", GREY),
+def _loop_theory(scenario: Scenario) -> list[Plot]:
+    n = scenario.n_joints
+    law = inversion(scenario.controller)
+    bounds = build_bounds(law, n, scenario.dt, first_order=False)
+    lines = [
+        Line(name, log10(scalar(column)), color, role="context")
+        for name, column, bound, color in (
+            ("bound on |e|", "ultimate_bound", bounds.joint, WHITE),
+            ("paper's, on ‖e_r‖", "ultimate_bound_paper", bounds.paper, GREY),
         )
-        if (trace[column] >= 0.0).all()  # negative where the gains in use have no such bound
+        if bound[0] != UNDEFINED
     ]
-    error = _joints("|e{}|", _log10(trace["q"] - trace["q_ref"]))
+    title = "Tracking error and its bounds (log₁₀ of rad)"
+    lyapunov = Line("L", log10(scalar("lyapunov")), WHITE)
     return [
-        _log_plot("lyapunov", "Lyapunov function L = ‖e_r‖² (log₁₀)", (lyapunov,)),
-        _log_plot(
-            "bounds",
-            "Tracking error and its bounds (log₁₀ of rad)",
-            (*bounds, *error),
-        ),
+        log_plot("lyapunov", "Lyapunov function L = ‖e_r‖² (log₁₀)", (lyapunov,)),
+        log_plot("bounds", title, (*lines, *_errors(n)), legend="RightTop"),
     ]
 
 
-def _timing(trace: Trace) -> list[Plot]:
-    deadline = 1e6 * trace.scenario.dt
+def _timing(scenario: Scenario) -> list[Plot]:
+    deadline = 1e6 * scenario.dt
     flags = (("saturated", RED), ("clipped", joint_color(1)), ("deadline_missed", WHITE))
     return [
         Plot(
             "compute_time",
             "Time for one update of the controller (µs)",
-            (Line("update", trace["compute_us"], joint_color(0), THIN),),
+            (Line("update", scalar("compute_us"), joint_color(0), THIN),),
             (Level("deadline", deadline, RED),),
             y_range=(0.0, 1.2 * deadline),  # the first update compiles, and would hide all others
+            legend="RightTop",
+        ),
+        Plot(
+            "wake_late",
+            "How late a tick began by the wall clock; 0 without --real-time (µs)",
+            (Line("late", scalar("wake_late_us"), joint_color(2), THIN),),
         ),
         Plot(
             "flags",
             "Flags (1 = yes)",
-            tuple(Line(n.replace("_", " "), trace[n].astype(float), c) for n, c in flags),
+            tuple(Line(name.replace("_", " "), scalar(name), color) for name, color in flags),
             y_range=(-0.1, 1.1),
+            legend="RightTop",
         ),
     ]
 
 
-def _log_plot(path: str, title: str, lines: tuple[Line, ...]) -> Plot:
-    return Plot(path, title, lines, pixel="largest")
+def _tip(scene: Scene) -> Plot:
+    """What the arm's error makes at its tip."""
+
+    def away(trace: Trace) -> Array:
+        between = scene.tip(trace["q"]) - scene.tip(trace["q_ref"])  # (N, 3)
+        return np.asarray(np.linalg.norm(between, axis=1))
+
+    line = Line("tip", log10(away), joint_color(0))
+    return log_plot("tip", "Distance of the tip from where it should be (log₁₀ of m)", (line,))
 
 
-def _against_reference(trace: Trace, name: str) -> tuple[Line, ...]:
+def _against_reference(scenario: Scenario, name: str) -> tuple[Line, ...]:
     """The reference, what was measured where that is not the true value, and the true value."""
-    symbol, actual = {"q": "q", "qd": "q̇"}[name], trace[name]
-    lines = _pale(symbol + "{} ref", trace[f"{name}_ref"])
-    if not np.array_equal(trace[f"{name}_meas"], actual):
-        measured = trace[f"{name}_meas"]
-        lines += tuple(
-            Line(f"{symbol}{j + 1} measured", column, GREY, THIN)
-            for j, column in enumerate(measured.T)
-        )
-    return lines + _joints(symbol + "{}", actual)
+    n, symbol = scenario.n_joints, {"q": "q", "qd": "q̇"}[name]
+    desired = pale(joints("desired", n, partial(entry, f"{name}_ref")))
+    lines = tuple(replace(line, role="shared") for line in desired)
+    if _sensors_err(scenario.imperfections):
+        measured = joints("measured", n, partial(entry, f"{name}_meas"))
+        lines += tuple(replace(line, color=GREY, width=THIN, role="context") for line in measured)
+    return lines + joints(symbol + "{}", n, partial(entry, name))
 
 
-def _joints(label: str, values: Array) -> tuple[Line, ...]:
-    """A line for each column, in the joints' colours; `label` with {} for the joint's number."""
-    return tuple(
-        Line(label.format(j + 1), column, joint_color(j)) for j, column in enumerate(values.T)
+def _sensors_err(imperfections: Imperfections) -> bool:
+    """Whether what is measured can be something else than what is."""
+    ideal = Imperfections()
+    names = ("noise", "bias", "drift")
+    erring = [f"{what}_{name}" for what in ("position", "velocity") for name in names]
+    return (
+        any(any(getattr(imperfections, name)) for name in erring)
+        or imperfections.sensor_delay > 0.0
+        or imperfections.jitter > 0.0
+        or imperfections.encoder_counts is not None
+        or imperfections.velocity_from != ideal.velocity_from
+        or bool(imperfections.external)
     )
 
 
-def _pale(label: str, values: Array) -> tuple[Line, ...]:
-    """Broad lines in lighter colours, to lie under those of `_joints`."""
-    return tuple(
-        Line(line.name, line.values, _lighter(line.color), BROAD) for line in _joints(label, values)
-    )
+def _drives_err(imperfections: Imperfections) -> bool:
+    """Whether the torque that acts can be another than the one commanded."""
+    names = ("torque_limit", "torque_rate", "actuator_lag", "actuator_delay", "external")
+    return any(bool(getattr(imperfections, name)) for name in names)
 
 
-def _layers(values: Array) -> tuple[Line, ...]:
-    count = values.shape[1]
-    mix = np.linspace(0.0, 1.0, count)[:, None]
-    colors = ((1.0 - mix) * _FIRST_LAYER + mix * _LAST_LAYER).astype(int).tolist()
-    return tuple(
-        Line(f"layer {k + 1}", column, tuple(color))
-        for k, (column, color) in enumerate(zip(values.T, colors, strict=True))
-    )
+def _errors(n: int) -> tuple[Line, ...]:
+    return joints("|e{}|", n, lambda j: log10(difference("q", "q_ref", j)))
 
 
-def _torque_limits(trace: Trace) -> tuple[Level, ...]:
-    limit = trace.scenario.imperfections.torque_limit
+def _torque_limits(scenario: Scenario) -> tuple[Level, ...]:
+    limit = scenario.imperfections.torque_limit
     if limit is None:
         return ()
-    values = expand(limit, trace.n_joints)
+    values = expand(limit, scenario.n_joints)
+    colors = [joint_color(j) for j in range(len(values))]
     if np.all(values == values[0]):
-        return _both_signs("limit", values[:1], [RED])
-    return _both_signs("limit {}", values, map(joint_color, range(len(values))))
-
-
-def _both_signs(label: str, values: Array, colors: Iterable[Rgb]) -> tuple[Level, ...]:
+        values, colors = values[:1], [RED]
     return tuple(
-        Level(sign + label.format(j + 1), factor * float(value), color)
-        for j, (value, color) in enumerate(zip(values, colors, strict=True))
-        for sign, factor in (("+", 1.0), ("−", -1.0))
+        Level("limit", sign * float(value), color)
+        for value, color in zip(values, colors, strict=True)
+        for sign in (1.0, -1.0)
     )
-
-
-def _lighter(color: Rgb) -> Rgb:
-    red, green, blue = (round(0.4 * c + 0.6 * 255) for c in color)
-    return red, green, blue
-
-
-def _log10(values: Array) -> Array:
-    """log₁₀ of the magnitude; zero, which has none, becomes a gap."""
-    magnitude = np.abs(values)
-    logarithm: Array = np.full(magnitude.shape, np.nan)
-    np.log10(magnitude, out=logarithm, where=magnitude > 0.0)
-    return logarithm

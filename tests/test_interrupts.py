@@ -1,0 +1,144 @@
+"""Ctrl-C, as a person presses it: once, several times, in a table and in JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from dnnmso_mj.errors import RunInterrupted
+from dnnmso_mj.interrupts import interrupted_once
+from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.reading import log_info, read_trace
+from dnnmso_mj.run import run_logged
+
+LISTENING = "import os, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
+LONG = ("run", "paper_no_network", "--set", "duration=3000", "--out", "long.mcap")
+
+
+def started(*args: str, cwd: Path) -> subprocess.Popen[str]:
+    """A command that listens to Ctrl-C, as one that a background shell starts does not."""
+    command = [sys.executable, "-c", f"{LISTENING}; os.execv(sys.argv[1], sys.argv[1:])"]
+    command += [str(Path(sys.executable).with_name("dnnmso")), *args]
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(command, cwd=cwd, stdout=pipe, stderr=pipe, text=True)
+    end, log = time.monotonic() + 120.0, cwd / "long.mcap"
+    while not (log.exists() and log.stat().st_size > 500_000):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end, "it does not run"
+        time.sleep(0.01)
+    return process
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[str, str]:
+    try:
+        return process.communicate(timeout=60)
+    finally:
+        process.kill()
+
+
+def test_one_ctrl_c_ends_with_the_summary_of_what_was_run(tmp_path):
+    process = started(*LONG, cwd=tmp_path)
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = ended(process)
+    assert process.returncode == 130
+    trace = read_trace(tmp_path / "long.mcap")
+    assert trace.info.status == "interrupted"
+    assert stdout.startswith("paper_no_network, seed 0: interrupted")
+    assert all(name in stdout for name in trace.info.metrics)
+    ran = f"{len(trace) * 0.001:g} s"
+    assert f"\n{ran} of 3000 s simulated in " in stdout
+    assert "dnnmso replay long.mcap" in stdout
+    assert stderr == f"interrupted; log: long.mcap ({ran} of 3000 s)\n"
+
+
+def test_interrupted_json_is_one_object_with_the_metrics_of_the_log(tmp_path):
+    process = started(*LONG, "--json", cwd=tmp_path)
+    process.send_signal(signal.SIGINT)
+    stdout, _ = ended(process)
+    assert process.returncode == 130
+    document = json.loads(stdout)
+    assert document["status"] == "interrupted"
+    assert document["figures"] == []
+    assert document["metrics"] == log_info(tmp_path / "long.mcap").metrics
+    assert document["log"] == "long.mcap"
+
+
+def test_pressing_it_again_and_again_loses_nothing_of_the_log(tmp_path):
+    process = started(*LONG, cwd=tmp_path)
+    while process.poll() is None:
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.002)
+    _, stderr = ended(process)
+    assert process.returncode == 130
+    assert "Traceback" not in stderr
+    info = log_info(tmp_path / "long.mcap")
+    assert (info.complete, info.status) == (True, "interrupted")
+    assert info.ticks > 1000
+    assert info.metrics["rmse"] is not None
+
+
+def test_a_ctrl_c_while_a_whole_run_ends_changes_nothing(tmp_path, monkeypatch):
+    """Pressed for real, at the moment when the log of a run that is done is being finished."""
+    from dnnmso_mj import run
+
+    compute = run.compute_metrics
+
+    def press(trace):
+        os.kill(os.getpid(), signal.SIGINT)
+        return compute(trace)
+
+    monkeypatch.setattr(run, "compute_metrics", press)
+    scenario = load_scenario("paper_no_network", ["duration=0.1"])
+    done = run_logged(scenario, tmp_path / "run.mcap")
+    assert done.trace.info.status == "ok"
+    assert log_info(tmp_path / "run.mcap").complete
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+    def stop(ticks):
+        raise KeyboardInterrupt
+
+    with pytest.raises(RunInterrupted) as interrupted:
+        run_logged(scenario, tmp_path / "stopped.mcap", progress=stop)
+    assert interrupted.value.ticks == len(interrupted.value.trace) > 0
+    assert log_info(tmp_path / "stopped.mcap").complete
+
+
+def test_the_first_raises_and_the_others_do_not():
+    with interrupted_once():
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_whoever_handles_signals_otherwise_is_left_alone():
+    heard = []
+    before = signal.signal(signal.SIGINT, lambda *_: heard.append(1))
+    try:
+        with interrupted_once():
+            os.kill(os.getpid(), signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert heard == [1]
+    failures = []
+
+    def elsewhere():
+        try:
+            with interrupted_once() as end:
+                end()
+        except ValueError as error:  # signals can be set in the first thread alone
+            failures.append(error)
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    assert not failures
