@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 TEXTS = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in PAGES}
 
-COARSE = ["--set", "dt=0.005"]
+COARSER, COARSE = ["--set", "dt=0.005"], ["--set", "dt=0.002"]
 BY_THE_CLOCK = ["--set", "duration=1.2"]
 WRITES_A_TABLE = {"sweep", "compare", "margins", "tune"}
 
@@ -29,19 +29,19 @@ WRITES_A_TABLE = {"sweep", "compare", "margins", "tune"}
 def cheaper(name: str, words: list[str]) -> list[str]:
     """Options that make a command cheap without making it another one.
 
-    A fifth of the ticks, one worker, fewer trials and no figures, which test_plots.py draws.
+    Fewer ticks and trials, one worker, and no figures, which test_plots.py draws.
     """
     if name == "run":
         return [*(BY_THE_CLOCK if "--real-time" in words else COARSE), "--no-plot"]
     if name == "check":
         return ["--states", "100"]
     if name == "audit":
-        return [*COARSE, "--jobs", "1"]
+        return [*COARSER, "--jobs", "1"]
     if name not in WRITES_A_TABLE:
         return []
     trials = ["--trials", "3"] if name == "tune" else []
     again = [] if "--resume" in words else ["--force"]  # pages may share a table's name
-    return [*COARSE, "--jobs", "1", *trials, *again]
+    return [*COARSER, "--jobs", "1", *trials, *again]
 
 
 def blocks(text: str, language: str) -> list[str]:
@@ -87,7 +87,7 @@ def workplace(tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for name in ("paper", "paper_no_network"):
-            invoke(f"dnnmso run {name}")
+            CliRunner().invoke(app, ["run", name, "--no-plot"], catch_exceptions=False)
     return folder
 
 
