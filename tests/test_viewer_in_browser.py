@@ -15,8 +15,8 @@ from PIL import Image
 
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.run import run_logged
+from dnnmso_mj.viewer.plot import JOINT_COLORS
 from dnnmso_mj.viewer.process import free_port
-from dnnmso_mj.viewer.signals import JOINT_COLORS
 from tests.browser import chromium, needs_chromium
 
 SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
