@@ -9,12 +9,14 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from dnnmso_mj.cli.shared import progress_bar, working
 from dnnmso_mj.errors import RunInterrupted
-from dnnmso_mj.interrupts import interrupted_once
+from dnnmso_mj.interrupts import heard, interrupted_once, raise_lost, remember_presses
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.reading import log_info, read_trace
 from dnnmso_mj.run import run_logged
@@ -120,15 +122,52 @@ def test_the_first_raises_and_the_others_do_not():
         os.kill(os.getpid(), signal.SIGINT)
 
 
+def press_in_vain(*_):
+    """As where a library is imported that has a bare except, or in a callback from C."""
+    with suppress(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_one_that_a_library_swallows_is_raised_again():
+    with interrupted_once() as end:
+        press_in_vain()
+        with pytest.raises(KeyboardInterrupt):
+            raise_lost()
+        end()
+        raise_lost()
+    before, told = signal.getsignal(signal.SIGINT), sys.unraisablehook
+    remember_presses()
+    try:
+        raise_lost()
+        press_in_vain()
+        with pytest.raises(KeyboardInterrupt), working("checking"):
+            pass
+        with pytest.raises(KeyboardInterrupt), progress_bar("run", 1):
+            pass
+    finally:
+        heard()
+        signal.signal(signal.SIGINT, before)
+        sys.unraisablehook = told
+
+
+def test_a_run_ends_by_one_that_a_library_swallows(tmp_path):
+    scenario = load_scenario("paper_no_network", ["duration=0.3"])
+    with pytest.raises(RunInterrupted) as interrupted:
+        run_logged(scenario, tmp_path / "run.mcap", progress=press_in_vain)
+    assert 0 < interrupted.value.ticks < scenario.n_ticks
+    assert log_info(tmp_path / "run.mcap").status == "interrupted"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_whoever_handles_signals_otherwise_is_left_alone():
-    heard = []
-    before = signal.signal(signal.SIGINT, lambda *_: heard.append(1))
+    calls = []
+    before = signal.signal(signal.SIGINT, lambda *_: calls.append(1))
     try:
         with interrupted_once():
             os.kill(os.getpid(), signal.SIGINT)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert heard == [1]
+    assert calls == [1]
     failures = []
 
     def elsewhere():
