@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from listening import started
 
 from dnnmso_mj.cli.shared import progress_bar, working
 from dnnmso_mj.errors import RunInterrupted
@@ -21,16 +22,12 @@ from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.reading import log_info, read_trace
 from dnnmso_mj.run import run_logged
 
-LISTENING = "import os, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
 LONG = ("run", "paper_no_network", "--set", "duration=3000", "--out", "long.mcap")
 
 
-def started(*args: str, cwd: Path) -> subprocess.Popen[str]:
-    """A command that listens to Ctrl-C, as one that a background shell starts does not."""
-    command = [sys.executable, "-c", f"{LISTENING}; os.execv(sys.argv[1], sys.argv[1:])"]
-    command += [str(Path(sys.executable).with_name("dnnmso")), *args]
-    pipe = subprocess.PIPE
-    process = subprocess.Popen(command, cwd=cwd, stdout=pipe, stderr=pipe, text=True)
+def running(*args: str, cwd: Path) -> subprocess.Popen[str]:
+    """A command that has written a part of its log."""
+    process = started(*args, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     end, log = time.monotonic() + 120.0, cwd / "long.mcap"
     while not (log.exists() and log.stat().st_size > 500_000):
         assert process.poll() is None, process.communicate()
@@ -47,7 +44,7 @@ def ended(process: subprocess.Popen[str]) -> tuple[str, str]:
 
 
 def test_one_ctrl_c_ends_with_the_summary_of_what_was_run(tmp_path):
-    process = started(*LONG, cwd=tmp_path)
+    process = running(*LONG, cwd=tmp_path)
     process.send_signal(signal.SIGINT)
     stdout, stderr = ended(process)
     assert process.returncode == 130
@@ -62,7 +59,7 @@ def test_one_ctrl_c_ends_with_the_summary_of_what_was_run(tmp_path):
 
 
 def test_interrupted_json_is_one_object_with_the_metrics_of_the_log(tmp_path):
-    process = started(*LONG, "--json", cwd=tmp_path)
+    process = running(*LONG, "--json", cwd=tmp_path)
     process.send_signal(signal.SIGINT)
     stdout, _ = ended(process)
     assert process.returncode == 130
@@ -74,7 +71,7 @@ def test_interrupted_json_is_one_object_with_the_metrics_of_the_log(tmp_path):
 
 
 def test_pressing_it_again_and_again_loses_nothing_of_the_log(tmp_path):
-    process = started(*LONG, cwd=tmp_path)
+    process = running(*LONG, cwd=tmp_path)
     while process.poll() is None:
         process.send_signal(signal.SIGINT)
         time.sleep(0.002)
