@@ -58,30 +58,23 @@ def test_one_ctrl_c_ends_with_the_summary_of_what_was_run(tmp_path):
     assert stderr == f"interrupted; log: long.mcap ({ran} of 3000 s)\n"
 
 
-def test_interrupted_json_is_one_object_with_the_metrics_of_the_log(tmp_path):
+def test_pressed_again_and_again_it_still_leaves_a_whole_log_and_whole_json(tmp_path):
     process = running(*LONG, "--json", cwd=tmp_path)
-    process.send_signal(signal.SIGINT)
-    stdout, _ = ended(process)
-    assert process.returncode == 130
-    document = json.loads(stdout)
-    assert document["status"] == "interrupted"
-    assert document["figures"] == []
-    assert document["metrics"] == log_info(tmp_path / "long.mcap").metrics
-    assert document["log"] == "long.mcap"
-
-
-def test_pressing_it_again_and_again_loses_nothing_of_the_log(tmp_path):
-    process = running(*LONG, cwd=tmp_path)
     while process.poll() is None:
         process.send_signal(signal.SIGINT)
         time.sleep(0.002)
-    _, stderr = ended(process)
+    stdout, stderr = ended(process)
     assert process.returncode == 130
     assert "Traceback" not in stderr
     info = log_info(tmp_path / "long.mcap")
     assert (info.complete, info.status) == (True, "interrupted")
     assert info.ticks > 1000
     assert info.metrics["rmse"] is not None
+    document = json.loads(stdout)
+    assert document["status"] == "interrupted"
+    assert document["figures"] == []
+    assert document["metrics"] == info.metrics
+    assert document["log"] == "long.mcap"
 
 
 def test_a_ctrl_c_while_a_whole_run_ends_changes_nothing(tmp_path, monkeypatch):
