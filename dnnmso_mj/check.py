@@ -8,6 +8,7 @@ import numpy as np
 
 from dnnmso_mj.dynamics import Links, TwoLink
 from dnnmso_mj.errors import ScenarioError
+from dnnmso_mj.interrupts import raise_lost
 from dnnmso_mj.plant import Mjcf, NominalModel, Plant, build_spec, compile_spec
 from dnnmso_mj.scenario import PAPER_MODEL, DnnMso, Initial, Scenario, Sinusoid
 from dnnmso_mj.scenario import Plant as PlantSpec
@@ -60,6 +61,7 @@ def check_dynamics(
     worst = dict.fromkeys(QUANTITIES, 0.0)
     n_arms = -(-n_states // STATES_PER_ARM)
     for arm in range(n_arms):
+        raise_lost()
         count = min(STATES_PER_ARM, n_states - arm * STATES_PER_ARM)
         for quantity, error in _compare_arm(mjcf, links, count, rng).items():
             worst[quantity] = float(

@@ -67,14 +67,14 @@ class Continuation:
             out, layout, scenario, scene, self.model.text, force=force, records=records, files=files
         ) as recorder:
 
-            def run() -> RunInfo:
+            def run(progress: Progress) -> RunInfo:
                 before = _Widened(recorder, theirs, layout)
                 _copy_before(self.source, self.tick, self.events, before)
                 return self._go_on(_Widened(recorder, ours, layout), progress)
 
-            return run_to_end(run, recorder, scenario, layout)
+            return run_to_end(run, recorder, scenario, layout, progress)
 
-    def _go_on(self, recorder: Recorder, progress: Progress | None) -> RunInfo:
+    def _go_on(self, recorder: Recorder, progress: Progress) -> RunInfo:
         state, simulation = self.state, self.simulation
         if state is not None and self.last.first == self.tick:
             t = self.tick * self.last.scenario.dt

@@ -13,7 +13,7 @@ import numpy as np
 
 from dnnmso_mj.assets import read_assets
 from dnnmso_mj.errors import LogError, RunInterrupted
-from dnnmso_mj.interrupts import interrupted_once
+from dnnmso_mj.interrupts import interrupted_once, raise_lost
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.paths import find_model, logs_dir
 from dnnmso_mj.plant import Mjcf
@@ -78,39 +78,47 @@ def run_logged(
     with _open_log(simulation, scene, mjcf, out, force) as recorder:
         sink = recorder if live is None else Tee(recorder, live)
 
-        def run() -> RunInfo:
+        def run(progress: Progress) -> RunInfo:
             with left_in_peace() if real_time else nullcontext() as priority:
                 if priority:
                     sink.event(Event(0.0, "info", f"real time, {priority}"))
                 return simulation.run(sink, progress)
 
-        return run_to_end(run, recorder, scenario, simulation.layout, live)
+        return run_to_end(run, recorder, scenario, simulation.layout, progress, live)
 
 
 def run_to_end(
-    run: Callable[[], RunInfo],
+    run: Callable[[Progress], RunInfo],
     recorder: McapRecorder,
     scenario: Scenario,
     layout: StepLayout,
+    progress: Progress | None,
     live: LiveView | None = None,
 ) -> LoggedRun:
     """Run, and end the log, and the live view, with the metrics of what was run.
 
     Args:
-        run: fills the log.
+        run: fills the log, and calls what it is given now and then.
         recorder: of the log.
         scenario: that is run.
         layout: of the log's rows.
+        progress: called then with the number of ticks done since.
         live: the view, which the run fills too.
 
     Raises:
         RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run. Another Ctrl-C
             while the log is being ended does nothing.
     """
+
+    def told(done: int) -> None:
+        raise_lost()
+        if progress is not None:
+            progress(done)
+
     with interrupted_once() as end:
         started = time.perf_counter()
         try:
-            info = run()
+            info = run(told)
         except KeyboardInterrupt as stop:
             end()
             wall = time.perf_counter() - started

@@ -13,19 +13,22 @@ from typing import Protocol
 import numpy as np
 from numba.core import event
 
+from dnnmso_mj.changes import Changes
 from dnnmso_mj.compile_loop import compile_elsewhere, compile_halves_elsewhere
 from dnnmso_mj.compiling import CompileNotice
 from dnnmso_mj.controllers import (
     LEARNING,
+    Command,
     Controller,
     build_controller,
     compiled_ticks,
 )
+from dnnmso_mj.divergence import not_finite, why_it_ended
 from dnnmso_mj.errors import NonFiniteError
 from dnnmso_mj.external.imperfection import Hooks
 from dnnmso_mj.imperfections.actuators import start_actuators
 from dnnmso_mj.imperfections.loads import start_loads
-from dnnmso_mj.imperfections.sensors import SensorBank, sense
+from dnnmso_mj.imperfections.sensors import SensorBank, Sensors, sense
 from dnnmso_mj.imperfections.tip import Tip
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK, MemoryRecorder
 from dnnmso_mj.plant import Mjcf, NominalModel, Plant
@@ -35,16 +38,11 @@ from dnnmso_mj.scenario.controller import lookahead
 from dnnmso_mj.theory import start_bounds
 from dnnmso_mj.tick import (
     CHUNK_START,
-    DIVERGED_ABOVE,
-    MISSED,
-    MUJOCO_ZEROES_ABOVE,
     OUT_OF_RANGE,
     ROWS,
     RUNNING,
     START_NS,
     STATUS,
-    TAU_NOT_FINITE,
-    TAU_TOO_LARGE,
     TOOK_NS,
     Pace,
     begin_tick,
@@ -61,10 +59,6 @@ Progress = Callable[[int], None]
 HEAD_START_NS = 20_000_000  # from a paced run's beginning to its first tick
 BLOCK = 50  # ticks between two looks at the recorder, progress and interrupts
 SNAPSHOT_PERIOD = 1.0  # s
-CHANGES = {
-    "saturated": ("torque limit reached", "torque limit left"),
-    "deadline_missed": ("deadline missed: the watchdog acts", "in time again"),
-}
 AS_FAST_AS_CAN_BE = Pace(0, 0, 0.0, np.zeros((0, 2), np.int64))
 
 
@@ -108,26 +102,19 @@ class Simulation:
         pace: Pace = AS_FAST_AS_CAN_BE,
         controller: Controller | None = None,
     ) -> None:
-        n, dt = scenario.n_joints, scenario.dt
-        self.scenario = scenario
+        self._mjcf = mjcf
         self.plant = Plant(scenario, mjcf)
-        self.reference = Reference(scenario.reference, n, scenario.duration)
-        self.hooks = Hooks(scenario, mjcf)
-        self._mjcf = None if controller else mjcf  # what the controller can be made of again
+        sensors = self._perceive(scenario)
+        self._given = controller is not None  # and no other process can make it again
         self.controller = controller or build_controller(scenario, mjcf, watch=watch)
-        self.layout = StepLayout(n, self.controller.n_layers)
-        self._columns = {name: self.layout.slices[name].start for name in CHANGES}
+        self.layout = StepLayout(scenario.n_joints, self.controller.n_layers)
         self._nominal = NominalModel(scenario, mjcf)
         of_interest = tip_of_interest(scenario)
         self._tip = Tip(self.plant.model, scenario.plant.model) if of_interest else None
-        self._sensors = SensorBank(scenario.imperfections, n, dt, scenario.seed, CHUNK)
         self._lookahead = lookahead(scenario.controller)
-        sensors, nominal, width = self._sensors.view, self._nominal.view, self.layout.width
-        if self.hooks:
-            sensors = sensors._replace(perfect=False)
+        nominal, width = self._nominal.view, self.layout.width
         self.world = build_world(scenario, self.plant, self._tip, sensors, nominal, pace, width)
         self._plan = plan(scenario, self.world.loads, self._tip, self.world.inputs.frozen)
-        self._flags = dict.fromkeys(CHANGES, False)
         self._first_state: dict[str, Array] | None = None
 
     def run(
@@ -155,9 +142,9 @@ class Simulation:
         try:
             self._loop(recorder, progress, self.scenario.n_ticks if until is None else until)
         except NonFiniteError as error:
-            t = self._tick * self.scenario.dt
+            t = self.tick * self.scenario.dt
             state = self.controller.state()
-            causes = [name for name, values in state.items() if not _finite(values)]
+            causes = not_finite(state)
             cause = f" with {', '.join(causes)} not finite" if causes else ""
             status, reason = "diverged", f"{error}{cause} at t = {t:.6g} s"
             recorder.event(Event(t, "error", f"diverged: {reason}"))
@@ -182,20 +169,33 @@ class Simulation:
         if start is not None:
             self._go_on(start)
 
+    def vary(self, scenario: Scenario) -> None:
+        """Take a scenario that differs in seed, initial state and reference alone; then `begin`."""
+        self.world = self.world._replace(sensors=self._perceive(scenario))
+
+    def _perceive(self, scenario: Scenario) -> Sensors:
+        """What the controller will be told: reference, sensors, and code from outside on them."""
+        n, seed = scenario.n_joints, scenario.seed
+        self.scenario = scenario
+        self.reference = Reference(scenario.reference, n, scenario.duration)
+        self.hooks = Hooks(scenario, self._mjcf)
+        self._sensors = SensorBank(scenario.imperfections, n, scenario.dt, seed, CHUNK)
+        view = self._sensors.view
+        return view._replace(perfect=view.perfect and not self.hooks)
+
     def state(self) -> State:
         """The state after `begin` or a run that has not diverged, copied."""
-        flags = np.array(list(self._flags.values()))
-        world = capture(self.world, self.plant, self.hooks, flags)
-        return State(self._tick, self.controller.state(), world)
+        world = capture(self.world, self.plant, self.hooks, self._changes.flags)
+        return State(self.tick, self.controller.state(), world)
 
     def _prepare(self) -> None:
         """Load or compile what ticks need, so that none of them pays for it."""
-        if self._ticks is None and self._mjcf is not None:
+        if self._ticks is None and not self._given:
             compile_halves_elsewhere(self.world, self.scenario, self._mjcf)
         with event.install_listener("numba:compile", CompileNotice()):
             if self._ticks is not None:
                 arguments = (self.world, self._ticks.parts, 0, 0)
-                if self._mjcf is not None:
+                if not self._given:
                     compile_elsewhere(self._ticks.run, arguments, self.scenario, self._mjcf)
                 self._ticks.run(*arguments)
             elif self.world.pace.period_ns:
@@ -220,16 +220,16 @@ class Simulation:
         start_bounds(world.bounds, x - np.concatenate([q_ref[0], qd_ref[0]]))
         world.tau[:] = 0.0
         world.inputs.frozen[0] = LEARNING
-        self._tick = self._happened = 0
+        self.tick = self._happened = 0
         world.counts[:] = 0
         self._begin_chunk(0)
         self.hooks.start()
         self.controller.reset(self._reading(x))
-        self._flags = dict.fromkeys(CHANGES, False)
+        self._changes = Changes(self.layout)
 
     def _go_on(self, start: State) -> None:
         """From the scenario's start to a later state; random numbers until then are passed over."""
-        self._tick = start.tick
+        self.tick = start.tick
         for happening in self._plan:
             if happening.tick < start.tick:
                 happening.act()
@@ -239,7 +239,7 @@ class Simulation:
         restore(self.world, self.plant, self.hooks, start.world)
         # What pushed in the period before is still to be accounted for.
         self.world = self.world._replace(loads=self.world.loads._replace(acting=True))
-        self._flags = dict(zip(CHANGES, start.world["flags"].tolist(), strict=True))
+        self._changes.flags[:] = start.world["flags"]
         if start.controller is None:
             self.controller.reset(self._reading(np.concatenate([self.plant.q, self.plant.qd])))
         else:
@@ -247,7 +247,7 @@ class Simulation:
 
     def _reading(self, x: Array) -> Array:
         """What the sensors say of the state x (2n,) at the present tick, and will say again."""
-        reading, sensors, k = x.copy(), self._sensors.view, self._tick
+        reading, sensors, k = x.copy(), self._sensors.view, self.tick
         if not sensors.perfect:
             last = sensors.last.copy()
             sense(sensors, x, k, k % CHUNK, reading)
@@ -260,17 +260,14 @@ class Simulation:
 
     def _loop(self, recorder: Recorder, progress: Progress | None, n_ticks: int) -> None:
         snapshot_every = self.snapshot_every
-        block = min(getattr(recorder, "block", BLOCK), LARGEST_BLOCK)
+        most = min(getattr(recorder, "block", BLOCK), LARGEST_BLOCK)
         self.world.counts[START_NS] = time.monotonic_ns() + HEAD_START_NS
-        while self._tick < n_ticks:
-            first = self._tick
+        while self.tick < n_ticks:
+            first = self.tick
             if first % snapshot_every == 0:
                 self._give_state(recorder)
-            if first == self.world.counts[CHUNK_START] + CHUNK:
-                self._begin_chunk(first)
-            ends = [first + block, n_ticks, self._happen(first, recorder)]
-            ends += [(first // every + 1) * every for every in (CHUNK, snapshot_every)]
-            count = min(ends) - first
+            end = min(self.open_block(recorder, most), n_ticks)
+            count = min(end, (first // snapshot_every + 1) * snapshot_every) - first
             self._run_block(first, count, recorder)
             if progress is not None:
                 progress(count)
@@ -279,19 +276,72 @@ class Simulation:
     def _give_state(self, recorder: Recorder) -> None:
         """A snapshot of the present state, for a recorder that keeps it."""
         if getattr(recorder, "keeps_snapshots", True):
-            t, state = self._tick * self.scenario.dt, self.state()
+            t, state = self.tick * self.scenario.dt, self.state()
             recorder.snapshot("controller", t, state.controller or {})
             recorder.snapshot("world", t, state.world)
 
-    def _happen(self, tick: int, recorder: Recorder) -> int:
+    def open_block(self, recorder: Recorder, most: int = LARGEST_BLOCK) -> int:
+        """Begin a block of ticks, with what happens before its first one.
+
+        Args:
+            recorder: is told what happens.
+            most: ticks in it, at most `LARGEST_BLOCK`.
+
+        Returns:
+            The tick that it must be closed before.
+        """
+        first, counts = self.tick, self.world.counts
+        if first == counts[CHUNK_START] + CHUNK:
+            self._begin_chunk(first)
+        counts[ROWS], counts[STATUS] = 0, RUNNING
+        return min(first + most, int(counts[CHUNK_START]) + CHUNK, self._happen(recorder))
+
+    def close_block(self, recorder: Recorder) -> None:
+        """Give the rows of a block's ticks, and what changed in them, to the recorder."""
+        rows = self.world.rows[: self.world.counts[ROWS]]
+        self.tick += len(rows)
+        if len(rows):
+            recorder.append(rows)
+            for change in self._changes.events(rows):
+                recorder.event(change)
+
+    def sense(self, k: int) -> bool:
+        """Begin tick k: what the controller is told of it; whether it has time to answer."""
+        in_time = bool(begin_tick(self.world, k))
+        self.hooks.sense(k * self.world.dt, self.world.inputs.x)
+        return in_time
+
+    def act(self, k: int, command: Command) -> bool:
+        """End tick k with a command, and step the arm; whether the run must end: see `divergence`.
+
+        Raises:
+            NonFiniteError: code from outside makes a torque that is not finite.
+        """
+        if not self.hooks:
+            return bool(end_tick(self.world, command, k))
+        world, row = self.world, self.world.counts[ROWS]
+        given = command._replace(tau=self.hooks.actuate(k * world.dt, command.tau))
+        ended = bool(end_tick(world, given, k))
+        if world.counts[ROWS] > row:  # what was asked for is logged, not what was made of it
+            world.rows[row, self.layout.slices["tau_cmd"]] = command.tau
+        return ended
+
+    def divergence(self) -> NonFiniteError:
+        """Why the run must end, once the block of that tick is closed."""
+        if self.world.counts[STATUS] == OUT_OF_RANGE:
+            self.tick -= 1  # such a row is recorded
+        return why_it_ended(self.world, self.layout)
+
+    def _happen(self, recorder: Recorder) -> int:
         """Let every event up to this tick happen; the tick of the next one, or the last."""
+        tick, last = self.tick, self.scenario.n_ticks
         for happening in self._plan[self._happened :]:
-            if happening.tick > tick:
+            if happening.tick > tick or tick == last:
                 return happening.tick
             self._happened += 1
             happening.act()
             recorder.event(Event(tick * self.scenario.dt, "info", happening.message))
-        return self.scenario.n_ticks
+        return last
 
     def _begin_chunk(self, first: int) -> None:
         """Reference and random numbers of the ticks from `first` on."""
@@ -309,79 +359,25 @@ class Simulation:
         Raises:
             NonFiniteError: the run must end; rows before it are recorded.
         """
-        counts = self.world.counts
-        counts[ROWS], counts[STATUS] = 0, RUNNING
         try:
             if self._ticks is not None:
                 self._ticks.run(self.world, self._ticks.parts, first, count)
             else:
                 self._run_interpreted(first, count)
         finally:
-            self._tick = first + int(counts[ROWS])
-            rows = self.world.rows[: counts[ROWS]]
-            if len(rows):
-                recorder.append(rows)
-                self._tell_changes(rows, recorder)
-        if counts[STATUS] != RUNNING:
-            raise self._why_it_ended()
+            self.close_block(recorder)
+        if self.world.counts[STATUS] != RUNNING:
+            raise self.divergence()
 
     def _run_interpreted(self, first: int, count: int) -> None:
-        world, hooks = self.world, self.hooks
+        world = self.world
         for k in range(first, first + count):
-            in_time = begin_tick(world, k)
-            hooks.sense(k * world.dt, world.inputs.x)
-            if in_time:
+            if self.sense(k):
                 began = time.perf_counter_ns()
                 self._command = self.controller.update(world.inputs)
                 world.counts[TOOK_NS] = time.perf_counter_ns() - began
-            if self._end_hooked(k) if hooks else end_tick(world, self._command, k):
+            if self.act(k, self._command):
                 return
-
-    def _end_hooked(self, k: int) -> bool:
-        """End tick k with what imperfections from outside make of the command; log the command."""
-        world, asked, row = self.world, self._command.tau, self.world.counts[ROWS]
-        given = self._command._replace(tau=self.hooks.actuate(k * world.dt, asked))
-        ended = bool(end_tick(world, given, k))
-        if world.counts[ROWS] > row:
-            world.rows[row, self.layout.slices["tau_cmd"]] = asked
-        return ended
-
-    def _why_it_ended(self) -> NonFiniteError:
-        """The quantity that a tick found wrong, and its value."""
-        counts, world = self.world.counts, self.world
-        tau = world.actuators.tau.tolist()
-        name = "the watchdog's tau" if counts[MISSED] else "tau"
-        if counts[STATUS] == TAU_NOT_FINITE:
-            return NonFiniteError(name, tau)
-        if counts[STATUS] == TAU_TOO_LARGE:
-            return NonFiniteError(name, f"{tau}, above {MUJOCO_ZEROES_ABOVE:g}")
-        out_of_range = counts[STATUS] == OUT_OF_RANGE
-        self._tick -= 1 if out_of_range else 0  # such a row is recorded
-        row = world.rows[counts[ROWS] - (1 if out_of_range else 0)]
-        fields = {name: row[where] for name, where in self.layout.slices.items()}
-        if out_of_range:
-            largest = {name: float(np.abs(fields[name]).max()) for name in ("q", "qd", "x_hat")}
-            name = next(name for name, value in largest.items() if value > DIVERGED_ABOVE)
-            return NonFiniteError(f"|{name}|", f"{largest[name]:.4g}, above {DIVERGED_ABOVE:g}")
-        name = next(name for name, values in fields.items() if not np.isfinite(values).all())
-        return NonFiniteError(name, fields[name].tolist())
-
-    def _tell_changes(self, rows: Array, recorder: Recorder) -> None:
-        """An event where the torque limit begins to act or ceases, and the watchdog likewise."""
-        for name, (begins, ends) in CHANGES.items():
-            flag = rows[:, self._columns[name]] != 0.0
-            if not (flag.any() or self._flags[name]):
-                continue
-            before = np.concatenate([[self._flags[name]], flag[:-1]])
-            self._flags[name] = bool(flag[-1])
-            for i in np.flatnonzero(flag != before):
-                level, what = ("warning", begins) if flag[i] else ("info", ends)
-                recorder.event(Event(float(rows[i, 0]), level, what))
-
-
-def _finite(values: Array) -> bool:
-    """Whether all numbers are finite; texts are."""
-    return values.dtype.kind in "SU" or bool(np.isfinite(values).all())
 
 
 def simulate(scenario: Scenario, mjcf: Mjcf | None = None, *, watch: bool = True) -> Trace:

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from listening import DNNMSO, started
 from trace_samples import METRICS
 
 from dnnmso_mj.loading import list_scenarios
 from dnnmso_mj.reading import read_trace
 
 ROOT = Path(__file__).parents[1]
-DNNMSO = Path(sys.executable).with_name("dnnmso")
 
 
 def dnnmso(*args: object, cwd: Path, **options) -> subprocess.CompletedProcess[str]:
@@ -252,7 +252,9 @@ def test_help_and_version_answer(tmp_path):
 
 def test_ctrl_c_while_the_loop_is_compiled_is_one_line_and_leaves_no_process(tmp_path):
     cold = {"NUMBA_CACHE_DIR": str(tmp_path / "cold")}
-    process = started("run", "paper", "--no-plot", cwd=tmp_path, stderr=subprocess.PIPE, env=cold)
+    process = started(
+        "run", "paper", "--no-plot", cwd=tmp_path, stderr=subprocess.PIPE, env=os.environ | cold
+    )
     try:
         assert process.stderr.readline().startswith("compiling")
         assert len(processes_with(f"NUMBA_CACHE_DIR={cold['NUMBA_CACHE_DIR']}")) == 2
@@ -298,27 +300,11 @@ def test_ctrl_c_outside_a_run_is_told_too(tmp_path):
     os.close(child)
     try:
         read_until(parent, b"comparing")
-        shown, pressed = b"", 0.0
-        while b"interrupted" not in shown:
-            if time.monotonic() - pressed > 5.0:  # a callback from C may swallow one
-                process.send_signal(signal.SIGINT)
-                pressed = time.monotonic()
-            shown += os.read(parent, 65536)
+        process.send_signal(signal.SIGINT)
+        read_until(parent, b"interrupted")
         assert process.wait(timeout=60) == 130
     finally:
         process.kill()
-
-
-def started(
-    *args: object, cwd: Path, stderr: int, env: dict[str, str] | None = None
-) -> subprocess.Popen[str]:
-    """A command that listens to Ctrl-C, as one that a background shell starts does not."""
-    listening = "import os, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    command = [sys.executable, "-c", f"{listening}; os.execv(sys.argv[1], sys.argv[1:])"]
-    command += [str(DNNMSO), *map(str, args)]
-    return subprocess.Popen(
-        command, cwd=cwd, stderr=stderr, text=True, env=os.environ | (env or {})
-    )
 
 
 def read_until(terminal: int, word: bytes) -> None:

@@ -112,6 +112,20 @@ def test_dm_control_s_episode_is_the_run_of_the_same_torques_bit_for_bit(pd_run)
     assert env.task.metrics["rmse"] == compute_metrics(pd_run)["rmse"]
 
 
+@QUIET
+def test_what_happens_at_the_edge_of_a_block_or_of_the_scenario_is_as_in_a_run():
+    push = "events=[{kind: push, at: 0.9, duration: 0.104, torque: [5.0, 0.0]}]"
+    sets = ("duration=1.004", "imperfections={position_noise: 1.0e-4}", push, "seed=7")
+    run = simulate(load_scenario("paper", sets, controller="pd"))
+    env, law = TrackingEnv("paper", sets, torque_scale=SCALE), pd_law()
+    observation, _ = env.reset(seed=7)
+    for k in range(len(run)):
+        if k % 500 == 0:
+            assert len(env.trace()) == k
+        observation, *_ = env.step(law(observation))
+    check_same(env.trace(), run)
+
+
 OUTSIDE_HOOKS = """
 class Worn:
     def __init__(self, setup):

@@ -9,26 +9,25 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from listening import started
 
+from dnnmso_mj.cli.shared import progress_bar, working
 from dnnmso_mj.errors import RunInterrupted
-from dnnmso_mj.interrupts import interrupted_once
+from dnnmso_mj.interrupts import heard, interrupted_once, raise_lost, remember_presses
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.reading import log_info, read_trace
 from dnnmso_mj.run import run_logged
 
-LISTENING = "import os, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
 LONG = ("run", "paper_no_network", "--set", "duration=3000", "--out", "long.mcap")
 
 
-def started(*args: str, cwd: Path) -> subprocess.Popen[str]:
-    """A command that listens to Ctrl-C, as one that a background shell starts does not."""
-    command = [sys.executable, "-c", f"{LISTENING}; os.execv(sys.argv[1], sys.argv[1:])"]
-    command += [str(Path(sys.executable).with_name("dnnmso")), *args]
-    pipe = subprocess.PIPE
-    process = subprocess.Popen(command, cwd=cwd, stdout=pipe, stderr=pipe, text=True)
+def running(*args: str, cwd: Path) -> subprocess.Popen[str]:
+    """A command that has written a part of its log."""
+    process = started(*args, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     end, log = time.monotonic() + 120.0, cwd / "long.mcap"
     while not (log.exists() and log.stat().st_size > 500_000):
         assert process.poll() is None, process.communicate()
@@ -45,7 +44,7 @@ def ended(process: subprocess.Popen[str]) -> tuple[str, str]:
 
 
 def test_one_ctrl_c_ends_with_the_summary_of_what_was_run(tmp_path):
-    process = started(*LONG, cwd=tmp_path)
+    process = running(*LONG, cwd=tmp_path)
     process.send_signal(signal.SIGINT)
     stdout, stderr = ended(process)
     assert process.returncode == 130
@@ -59,30 +58,23 @@ def test_one_ctrl_c_ends_with_the_summary_of_what_was_run(tmp_path):
     assert stderr == f"interrupted; log: long.mcap ({ran} of 3000 s)\n"
 
 
-def test_interrupted_json_is_one_object_with_the_metrics_of_the_log(tmp_path):
-    process = started(*LONG, "--json", cwd=tmp_path)
-    process.send_signal(signal.SIGINT)
-    stdout, _ = ended(process)
-    assert process.returncode == 130
-    document = json.loads(stdout)
-    assert document["status"] == "interrupted"
-    assert document["figures"] == []
-    assert document["metrics"] == log_info(tmp_path / "long.mcap").metrics
-    assert document["log"] == "long.mcap"
-
-
-def test_pressing_it_again_and_again_loses_nothing_of_the_log(tmp_path):
-    process = started(*LONG, cwd=tmp_path)
+def test_pressed_again_and_again_it_still_leaves_a_whole_log_and_whole_json(tmp_path):
+    process = running(*LONG, "--json", cwd=tmp_path)
     while process.poll() is None:
         process.send_signal(signal.SIGINT)
         time.sleep(0.002)
-    _, stderr = ended(process)
+    stdout, stderr = ended(process)
     assert process.returncode == 130
     assert "Traceback" not in stderr
     info = log_info(tmp_path / "long.mcap")
     assert (info.complete, info.status) == (True, "interrupted")
     assert info.ticks > 1000
     assert info.metrics["rmse"] is not None
+    document = json.loads(stdout)
+    assert document["status"] == "interrupted"
+    assert document["figures"] == []
+    assert document["metrics"] == info.metrics
+    assert document["log"] == "long.mcap"
 
 
 def test_a_ctrl_c_while_a_whole_run_ends_changes_nothing(tmp_path, monkeypatch):
@@ -120,15 +112,52 @@ def test_the_first_raises_and_the_others_do_not():
         os.kill(os.getpid(), signal.SIGINT)
 
 
+def press_in_vain(*_):
+    """As where a library is imported that has a bare except, or in a callback from C."""
+    with suppress(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_one_that_a_library_swallows_is_raised_again():
+    with interrupted_once() as end:
+        press_in_vain()
+        with pytest.raises(KeyboardInterrupt):
+            raise_lost()
+        end()
+        raise_lost()
+    before, told = signal.getsignal(signal.SIGINT), sys.unraisablehook
+    remember_presses()
+    try:
+        raise_lost()
+        press_in_vain()
+        with pytest.raises(KeyboardInterrupt), working("checking"):
+            pass
+        with pytest.raises(KeyboardInterrupt), progress_bar("run", 1):
+            pass
+    finally:
+        heard()
+        signal.signal(signal.SIGINT, before)
+        sys.unraisablehook = told
+
+
+def test_a_run_ends_by_one_that_a_library_swallows(tmp_path):
+    scenario = load_scenario("paper_no_network", ["duration=0.3"])
+    with pytest.raises(RunInterrupted) as interrupted:
+        run_logged(scenario, tmp_path / "run.mcap", progress=press_in_vain)
+    assert 0 < interrupted.value.ticks < scenario.n_ticks
+    assert log_info(tmp_path / "run.mcap").status == "interrupted"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_whoever_handles_signals_otherwise_is_left_alone():
-    heard = []
-    before = signal.signal(signal.SIGINT, lambda *_: heard.append(1))
+    calls = []
+    before = signal.signal(signal.SIGINT, lambda *_: calls.append(1))
     try:
         with interrupted_once():
             os.kill(os.getpid(), signal.SIGINT)
     finally:
         signal.signal(signal.SIGINT, before)
-    assert heard == [1]
+    assert calls == [1]
     failures = []
 
     def elsewhere():

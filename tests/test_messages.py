@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
 import warnings
 from pathlib import Path
@@ -106,13 +107,15 @@ def refused(command: str, monkeypatch: pytest.MonkeyPatch) -> int | str | None:
     """The status that the command ends with, run by the entry point itself."""
     monkeypatch.setattr(sys, "argv", ["dnnmso", *command.split()])
     monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
-    thresholds = gc.get_threshold()
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    thresholds, handler = gc.get_threshold(), signal.getsignal(signal.SIGINT)
     try:
         with pytest.raises(SystemExit) as end, warnings.catch_warnings():
             cli.main()
     finally:
         gc.set_threshold(*thresholds)
         gc.unfreeze()
+        signal.signal(signal.SIGINT, handler)
     return end.value.code
 
 

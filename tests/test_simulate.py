@@ -14,7 +14,8 @@ from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf
-from dnnmso_mj.simulation import DIVERGED_ABOVE, Simulation, simulate
+from dnnmso_mj.simulation import Simulation, simulate
+from dnnmso_mj.tick import DIVERGED_ABOVE
 from dnnmso_mj.trace import Trace
 
 MEASURED_TIMES = {"compute_us", "deadline_missed"}

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 DNNMSO = str(Path(sys.executable).with_name("dnnmso"))
-TABLE, ERROR, HELP = ("controllers",), ("info", "nothing"), ("--help",)
+TABLE, ERROR, HELP = ("scenarios",), ("info", "paper"), ("--help",)
 ESCAPE = "\x1b["
 COLOUR = r"\x1b\[(1;)?3[0-7]m"
 CLEAN = {
@@ -62,7 +62,7 @@ def test_a_terminal_gets_colour_unless_it_asks_for_none(args, tmp_path):
     for more in ({"NO_COLOR": "1"}, {"TERM": "dumb"}):
         plain = on_a_terminal(args, tmp_path, **more)
         assert not re.search(COLOUR, plain), more
-        assert "nothing" in plain
+        assert "paper" in plain
 
 
 @pytest.mark.parametrize("args", [TABLE, ERROR, HELP, ("fly",)], ids=lambda args: args[0])
@@ -77,7 +77,7 @@ def test_a_pipe_gets_none_unless_it_asks_for_some(args, tmp_path):
 def test_an_error_is_the_same_text_with_colour_and_without(tmp_path):
     plain = in_a_pipe(ERROR, tmp_path)
     coloured = on_a_terminal(ERROR, tmp_path).replace("\r\n", "\n")
-    assert plain.startswith("error: nothing: no such log")
+    assert plain.startswith("error: paper: no such log")
     assert coloured == plain.replace("error", "\x1b[1;31merror\x1b[0m", 1)
 
 

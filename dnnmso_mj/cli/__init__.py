@@ -35,6 +35,7 @@ from dnnmso_mj.cli import (
 from dnnmso_mj.cli.shared import BAD_INPUT, INTERRUPTED, say
 from dnnmso_mj.errors import DnnmsoError
 from dnnmso_mj.extras import extra_of, pip_install
+from dnnmso_mj.interrupts import remember_presses
 
 COMPLETE = "_DNNMSO_COMPLETE"  # set by a shell that asks for completions
 
@@ -51,6 +52,7 @@ def main() -> NoReturn:
     """Entry point: run the command line; people's errors are one message and status 2."""
     # Imports make objects by the hundred thousand and hardly any garbage: half a second of a start.
     gc.set_threshold(100_000, 50, 100)
+    remember_presses()
     warnings.showwarning = _Warnings().show
     warnings.simplefilter("always", UserWarning)
     _degrade()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dnnmso_mj.cli.completing import complete_log, complete_scenario, complete_set
+from dnnmso_mj.interrupts import raise_lost
 from dnnmso_mj.paths import find_log
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ def working(what: str) -> AbstractContextManager[object]:
     """A spinner on standard error, when that is a terminal, for work of unknown length."""
     from rich.console import Console
 
+    raise_lost()
     console = Console(stderr=True)
     return console.status(f"{what} …") if console.is_terminal else nullcontext()
 
@@ -88,6 +90,7 @@ def progress_bar(name: str, total: int | None) -> Iterator[Progress]:
     from rich.progress import TimeRemainingColumn as TimeColumn
 
     console = Console(stderr=True)
+    raise_lost()
     columns = (TextColumn(name), BarColumn(), TaskProgressColumn(), TimeColumn())
     with Progress(
         *columns, console=console, transient=True, disable=not console.is_terminal

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from dnnmso_mj.cli.shared import near
+from dnnmso_mj.interrupts import raise_lost
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -46,6 +47,7 @@ class Watch:
             self._task = self._bar.add_task("", total=total, completed=kept, text=self._text())
 
     def row(self, row: Row) -> None:
+        raise_lost()
         self.done += 1
         self.failures += row["status"] in self._bad
         self._ticks += row["ticks"]
@@ -80,6 +82,7 @@ def watching(name: str, bad: tuple[str, ...] = ("diverged", "failed")) -> Iterat
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+    raise_lost()
     console = Console(stderr=True, markup=False)
     if not console.is_terminal:
         yield Watch(name, None, bad)

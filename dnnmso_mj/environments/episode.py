@@ -14,20 +14,15 @@ from dnnmso_mj.consistency import MULTIPLE, is_multiple
 from dnnmso_mj.controllers import Command, Inputs
 from dnnmso_mj.controllers.measured import empty_command, show_measured
 from dnnmso_mj.errors import DnnmsoError, NonFiniteError, ScenarioError
-from dnnmso_mj.external.imperfection import Hooks
-from dnnmso_mj.imperfections.sensors import SensorBank
 from dnnmso_mj.loading import load_scenario
-from dnnmso_mj.memory_recorder import LARGEST_BLOCK, MemoryRecorder
+from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import Metrics, compute_metrics
 from dnnmso_mj.observation import PARTS, observe, torque, torque_scale
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
-from dnnmso_mj.reference import Reference
 from dnnmso_mj.scenario import Policy, Scenario
 from dnnmso_mj.simulation import Simulation
-from dnnmso_mj.tick import ROWS, RUNNING, STATUS, begin_tick, end_tick
 from dnnmso_mj.trace import Event, RunInfo, Trace
-from dnnmso_mj.world import CHUNK
 
 Array = np.ndarray
 
@@ -69,7 +64,7 @@ class FromOutside:
         """It has no memory."""
 
 
-class Episode(Simulation):
+class Episode:
     """A scenario driven from outside; call `restart` first.
 
     Args:
@@ -79,7 +74,9 @@ class Episode(Simulation):
             or 128 without one.
 
     Attributes:
-        scale: the same, (n,).
+        scenario: of the episode.
+        plant: its arm.
+        scale: as given, (n,).
         over: whether the end was reached.
         error: why it was reached before its time; "" otherwise.
 
@@ -101,9 +98,11 @@ class Episode(Simulation):
         scenario = _driven_from_outside(scenario, each)
         self.scale = torque_scale(scenario, each)
         self._outside = FromOutside(scenario.n_joints)
-        self._model = Mjcf.read(find_model(scenario.plant.model))
-        super().__init__(scenario, self._model, controller=self._outside)
-        compile_halves_elsewhere(self.world, scenario, self._model)
+        mjcf = Mjcf.read(find_model(scenario.plant.model))
+        self.scenario = scenario
+        self._simulation = Simulation(scenario, mjcf, controller=self._outside)
+        self.plant = self._simulation.plant
+        compile_halves_elsewhere(self._simulation.world, scenario, mjcf)
         self.over, self.error = True, ""
 
     @property
@@ -118,25 +117,19 @@ class Episode(Simulation):
             scenario: the episode's own, which differs from the first in seed, initial state and
                 reference alone: see `start.episode_scenario`.
         """
-        self.scenario, n = scenario, scenario.n_joints
-        self.reference = Reference(scenario.reference, n, scenario.duration)
-        if self.hooks:
-            self.hooks = Hooks(scenario, self._model)
-        sensors = SensorBank(scenario.imperfections, n, scenario.dt, scenario.seed, CHUNK)
-        perfect = sensors.view.perfect and not self.hooks
-        self.world = self.world._replace(sensors=sensors.view._replace(perfect=perfect))
-        self._sensors = sensors
-        self._recorder = MemoryRecorder(self.layout, scenario.n_ticks)
+        self.scenario = scenario
+        self._recorder = MemoryRecorder(self._simulation.layout, scenario.n_ticks)
         self.over, self.error = False, ""
         self._began, self._tick = time.perf_counter(), 0
-        self._start()
+        self._simulation.vary(scenario)
+        self._simulation.begin()
         self._open_block()
-        self._tell()
+        self._simulation.sense(0)
 
     def observation(self) -> Array:
         """What is told of the present tick: a new vector (6n,); see `observation`."""
         out = np.empty(len(PARTS) * self.scenario.n_joints)
-        observe(self.world.inputs, out)
+        observe(self._simulation.world.inputs, out)
         return out
 
     def torque(self, action: Array) -> Array:
@@ -172,7 +165,7 @@ class Episode(Simulation):
         if self.error:
             return 0.0
         n = self.scenario.n_joints
-        e, share = self.world.e_track[:n], self._outside.command.tau / self.scale
+        e, share = self._simulation.world.e_track[:n], self._outside.command.tau / self.scale
         near = 1.0 / (1.0 + float(e @ e) / PRECISION**2)
         return near * max(0.0, 1.0 - EFFORT * float(share @ share) / n)
 
@@ -183,7 +176,7 @@ class Episode(Simulation):
     def trace(self) -> Trace:
         """The episode so far, as `simulate` returns a run."""
         if not self.over:
-            self._close_block()
+            self._simulation.close_block(self._recorder)
             self._open_block()
         status = "diverged" if self.error else "ok" if self.over else "unfinished"
         wall = time.perf_counter() - self._began
@@ -196,55 +189,32 @@ class Episode(Simulation):
 
     def _advance(self, tau: Array) -> None:
         """One tick from its command on, and the next one up to what is told of it."""
-        self._command = self._outside.update(self.world.inputs)
-        self._command.tau[:] = tau
+        simulation = self._simulation
+        command = self._outside.update(simulation.world.inputs)
+        command.tau[:] = tau
         try:
-            if self._end():
-                self._close_block()
-                self._end_early(self._why_it_ended())
+            if simulation.act(self._tick, command):
+                simulation.close_block(self._recorder)
+                self._end_early(simulation.divergence())
                 return
             self._tick += 1
             self.over = self._tick == self.scenario.n_ticks
             if self._tick == self._block_end:
-                self._close_block()
+                simulation.close_block(self._recorder)
                 self._open_block()
-            self._tell()
+            simulation.sense(self._tick)
         except NonFiniteError as error:  # of an imperfection from outside
-            self._close_block()
+            simulation.close_block(self._recorder)
             self._end_early(error)
-
-    def _end(self) -> bool:
-        if self.hooks:
-            return self._end_hooked(self._tick)
-        return bool(end_tick(self.world, self._command, self._tick))
-
-    def _tell(self) -> None:
-        """What the sensors and the reference say of the present tick."""
-        begin_tick(self.world, self._tick)
-        self.hooks.sense(self.t, self.world.inputs.x)
 
     def _open_block(self) -> None:
         """Rows are kept block by block, as `Simulation.run` does; what is due now happens."""
-        first = self._tick
-        if first % CHUNK == 0 and first > 0:
-            self._begin_chunk(first)
-        happens = self._happen(first, self._recorder)
-        ends = [first + LARGEST_BLOCK, (first // CHUNK + 1) * CHUNK]
-        self._block_end = min([*ends, *([] if self.over else [happens])])
-        self._first = first
-        self.world.counts[ROWS], self.world.counts[STATUS] = 0, RUNNING
-
-    def _close_block(self) -> None:
-        rows = self.world.rows[: self.world.counts[ROWS]]
-        self._tick = self._first + len(rows)
-        if len(rows):
-            self._recorder.append(rows)
-            self._tell_changes(rows, self._recorder)
+        self._block_end = self._simulation.open_block(self._recorder)
 
     def _end_early(self, error: NonFiniteError) -> None:
-        t = self._tick * self.scenario.dt
-        self.over, self.error = True, f"{error} at t = {t:.6g} s"
-        self._recorder.event(Event(t, "error", f"diverged: {self.error}"))
+        self._tick = self._simulation.tick
+        self.over, self.error = True, f"{error} at t = {self.t:.6g} s"
+        self._recorder.event(Event(self.t, "error", f"diverged: {self.error}"))
 
 
 def _driven_from_outside(scenario: Scenario, scale: tuple[float, ...] | None) -> Scenario:

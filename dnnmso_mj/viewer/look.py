@@ -4,21 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dnnmso_mj.viewer.plot import Line, Rgb, lighter
+from dnnmso_mj.viewer.plot import JOINT_COLORS, Line, Rgb, lighter
 
 Point = tuple[float, float, float]
 
 # Far apart in hue and alike in lightness, so that none of two runs draws the eye.
-RUN_COLORS: tuple[Rgb, ...] = (
-    (66, 150, 250),
-    (255, 150, 50),
-    (80, 200, 130),
-    (240, 90, 110),
-    (180, 140, 245),
-    (230, 200, 80),
-    (80, 200, 210),
-    (235, 130, 200),
-)
+RUN_COLORS = (*JOINT_COLORS, (235, 130, 200))
 COMMON_COLOR: Rgb = (115, 115, 115)
 
 

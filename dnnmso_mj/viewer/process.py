@@ -18,6 +18,7 @@ from types import FrameType
 from typing import IO, TYPE_CHECKING, TypeVar
 
 from dnnmso_mj.errors import DnnmsoError, MissingExtraError
+from dnnmso_mj.interrupts import heard
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
@@ -203,6 +204,7 @@ def until_interrupted() -> Iterator[None]:
     try:
         with contextlib.suppress(KeyboardInterrupt):
             yield
+        heard()
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
