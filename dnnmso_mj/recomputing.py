@@ -186,6 +186,7 @@ def _versions(source: Recorded) -> str:
     if differing:
         return f"It was made with {', '.join(differing)}."
     said = "It was made with the same versions, so on another kind of processor"
-    if any(any(named_code(each.scenario.model_dump())) for each in source.segments):
+    scenarios = [part.scenario for part in source.segments]
+    if any(code_of(each) or any(named_code(each.model_dump())) for each in scenarios):
         return f"{said}, or its code has changed, or remembers more than its state() gives."
     return f"{said}."
