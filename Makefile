@@ -7,7 +7,7 @@ PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint const
 SCENARIO ?= scenarios/paper.yaml
 PYTEST_ARGS ?=
 
-.PHONY: help run test check format figures experiments schema build clean
+.PHONY: help run test check format figures experiments schema docs build clean
 
 help:
 	@echo "make run      install, run $(SCENARIO), print where the log and the figures are"
@@ -17,6 +17,7 @@ help:
 	@echo "make figures  draw the pictures of the README and docs anew"
 	@echo "make experiments  tune, compare and audit all that docs/findings.md quotes; long"
 	@echo "make schema   write scenarios/scenario.schema.json anew"
+	@echo "make docs     build the documentation site; open site/index.html"
 	@echo "make build    build wheel and sdist into dist/"
 	@echo "make clean    remove the environment and all caches"
 
@@ -45,11 +46,15 @@ schema: $(VENV)/.installed-run
 	$(BIN)/dnnmso schema > $(VENV)/schema.json
 	mv $(VENV)/schema.json scenarios/scenario.schema.json
 
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "site/index.html; with its search: $(BIN)/python -m http.server --directory site --bind 127.0.0.1"
+
 build: $(VENV)/.installed-test
 	$(BIN)/python -m build --no-isolation
 
 clean:
-	rm -rf $(VENV) dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) dist site .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/bin/pip:
@@ -61,10 +66,14 @@ $(VENV)/.installed-run: pyproject.toml constraints.txt | $(VENV)/bin/pip
 	$(PIP) --editable ".[standard]"
 	@touch $@
 
+$(VENV)/.installed-docs: pyproject.toml constraints.txt | $(VENV)/bin/pip
+	$(PIP) --editable ".[docs]"
+	@touch $@
+
 $(VENV)/.installed-test: pyproject.toml constraints.txt | $(VENV)/bin/pip
 	$(PIP) --editable ".[test]"
-	@touch $@ $(VENV)/.installed-run
+	@touch $@ $(VENV)/.installed-run $(VENV)/.installed-docs
 
 $(VENV)/.installed-check: pyproject.toml constraints.txt | $(VENV)/bin/pip
 	$(PIP) --editable ".[check]"
-	@touch $@ $(VENV)/.installed-run $(VENV)/.installed-test
+	@touch $@ $(VENV)/.installed-run $(VENV)/.installed-docs $(VENV)/.installed-test

@@ -2,10 +2,11 @@
 
 What most people need is here; each name is imported when it is first used.
 
->>> from dnnmso_mj import load_scenario, simulate
->>> trace = simulate(load_scenario("paper", ["duration=0.1"], controller="pd"))
->>> trace["q"].shape
-(100, 2)
+Examples:
+    >>> from dnnmso_mj import load_scenario, simulate
+    >>> trace = simulate(load_scenario("paper", ["duration=0.1"], controller="pd"))
+    >>> trace["q"].shape
+    (100, 2)
 """
 
 from __future__ import annotations

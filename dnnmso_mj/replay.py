@@ -6,20 +6,14 @@ Every function takes one log, or a sequence of up to eight to compare in one vie
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import sys
 import tempfile
-import urllib.parse
-import urllib.request
 from collections.abc import Iterator, Sequence
-from http import HTTPStatus
 from pathlib import Path
-from signal import SIGHUP, SIGTERM
-from types import FrameType
 
 from dnnmso_mj.assets import put_back
-from dnnmso_mj.errors import DnnmsoError, LogError, MissingExtraError, ScenarioError
+from dnnmso_mj.errors import DnnmsoError, LogError, ScenarioError
+from dnnmso_mj.extras import require
 from dnnmso_mj.log.format import MODEL, unwritable
 from dnnmso_mj.plant import build_spec, compile_spec
 from dnnmso_mj.reading import Snapshot
@@ -27,15 +21,15 @@ from dnnmso_mj.recorded import Recorded, read_recorded
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.viewer.plot import TIMELINE
 from dnnmso_mj.viewer.process import (
-    LOCAL,
-    check_port,
+    check_display,
     free_port,
     headless_viewer,
-    listens,
     picture,
     rerun,
+    until_interrupted,
 )
 from dnnmso_mj.viewer.summary import drawable
+from dnnmso_mj.viewer.web import web_server
 
 Logs = Path | Sequence[Path]
 
@@ -72,13 +66,11 @@ def open_viewer(logs: Logs, first_tab: str = "Tracking", *, side_by_side: bool =
         DnnmsoError: there is no display, or the viewer cannot start.
         LogError, MissingExtraError: as `save_rrd`.
     """
-    if sys.platform == "linux" and not _has_display():
-        raise DnnmsoError(
-            "no display: neither DISPLAY nor WAYLAND_DISPLAY is set. Use `dnnmso replay` with "
-            "--serve (a browser), --screenshot FILE.png, or --save FILE.rrd"
-        )
+    check_display(
+        "Use `dnnmso replay` with --serve (a browser), --screenshot FILE.png, or --save FILE.rrd"
+    )
     with (
-        _until_interrupted(),
+        until_interrupted(),
         _converted(logs, first_tab, side_by_side) as (rrd, _),
         rerun("--port", str(free_port()), str(rrd)) as viewer,
     ):
@@ -99,19 +91,14 @@ def serve(
         DnnmsoError: the port is taken, or the server cannot start.
         LogError, MissingExtraError: as `save_rrd`.
     """
-    check_port(port)
-    data_port, page = free_port(), f"http://{LOCAL}:{port}"
-    data = urllib.parse.quote(f"rerun+http://{LOCAL}:{data_port}/proxy", safe="")
-    arguments = ("--serve-web", "--web-viewer-port", str(port), "--port", str(data_port))
     with (
-        _until_interrupted(),
+        until_interrupted(),
         _converted(logs, first_tab, side_by_side) as (rrd, _),
-        rerun(*arguments, str(rrd)) as server,
+        web_server(port, str(rrd)) as server,
     ):
-        server.wait_until(lambda: listens(data_port) and _answers(page), "ready")
-        print(f"{page}/?url={data}", flush=True)
+        print(server.page, flush=True)
         print("Ctrl-C ends it.", file=sys.stderr)
-        server.wait()
+        server.process.wait()
 
 
 def screenshot(
@@ -158,14 +145,9 @@ def _several(logs: Logs) -> Sequence[Path]:
 
 def _convert(logs: Sequence[Path], out: Path, first_tab: str, side_by_side: bool) -> float:
     """Write the recording of some logs; returns the last time in it (s)."""
-    try:
-        from dnnmso_mj.viewer.rrd import Run, rrd_bytes
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "rerun":
-            raise
-        raise MissingExtraError(
-            "the viewer needs rerun, which is not installed: pip install 'dnnmso_mj[viewer]'"
-        ) from error
+    require("viewer", "the viewer")
+    from dnnmso_mj.viewer.rrd import Run, rrd_bytes
+
     runs = []
     for name, log in zip(run_names(logs), logs, strict=True):
         found = read_recorded(log)
@@ -243,31 +225,3 @@ def _replacing(path: Path, suffix: str) -> Iterator[Path]:
             partial.replace(path)
     except OSError as error:
         raise unwritable(path, error) from error
-
-
-@contextlib.contextmanager
-def _until_interrupted() -> Iterator[None]:
-    """Leave the block in good order at Ctrl-C, on SIGTERM, or when the terminal closes."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (SIGTERM, SIGHUP)}
-    try:
-        with contextlib.suppress(KeyboardInterrupt):
-            yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _has_display() -> bool:
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def _answers(page: str) -> bool:
-    try:
-        with urllib.request.urlopen(page, timeout=1.0) as response:  # noqa: S310
-            return bool(response.status == HTTPStatus.OK)
-    except OSError:
-        return False

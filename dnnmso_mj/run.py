@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,7 +23,11 @@ from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.simulation import AS_FAST_AS_CAN_BE, Progress, Simulation
+from dnnmso_mj.tee import Tee
 from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
+
+if TYPE_CHECKING:
+    from dnnmso_mj.viewer.live import LiveView
 
 MAX_NUMBERED = 10_000
 
@@ -43,6 +47,7 @@ def run_logged(
     force: bool = False,
     real_time: bool = False,
     progress: Progress | None = None,
+    live: LiveView | None = None,
 ) -> LoggedRun:
     """Run a scenario and leave a log with metrics.
 
@@ -55,37 +60,48 @@ def run_logged(
         force: whether an existing `out` is replaced.
         real_time: whether ticks are paced by the wall clock; see `realtime`.
         progress: called now and then with the number of ticks done since.
+        live: a viewer to show the run in while it goes on.
 
     Raises:
         ScenarioError: the model cannot be used; no log is left behind.
         LogError: the log exists or cannot be written.
+        DnnmsoError: the live view cannot start; no log is left behind.
         RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run. Another Ctrl-C
             while the log is being ended does nothing.
     """
     mjcf = Mjcf.read(find_model(scenario.plant.model))
     pace = real_time_pace(scenario) if real_time else AS_FAST_AS_CAN_BE
     simulation = Simulation(scenario, mjcf, pace=pace)
-    with _open_log(simulation, mjcf, out, force) as recorder:
+    scene = Scene(simulation.plant.model)
+    if live is not None:
+        live.begin(scenario, scene, simulation.layout)
+    with _open_log(simulation, scene, mjcf, out, force) as recorder:
+        sink = recorder if live is None else Tee(recorder, live)
 
         def run() -> RunInfo:
             with left_in_peace() if real_time else nullcontext() as priority:
                 if priority:
-                    recorder.event(Event(0.0, "info", f"real time, {priority}"))
-                return simulation.run(recorder, progress)
+                    sink.event(Event(0.0, "info", f"real time, {priority}"))
+                return simulation.run(sink, progress)
 
-        return run_to_end(run, recorder, scenario, simulation.layout)
+        return run_to_end(run, recorder, scenario, simulation.layout, live)
 
 
 def run_to_end(
-    run: Callable[[], RunInfo], recorder: McapRecorder, scenario: Scenario, layout: StepLayout
+    run: Callable[[], RunInfo],
+    recorder: McapRecorder,
+    scenario: Scenario,
+    layout: StepLayout,
+    live: LiveView | None = None,
 ) -> LoggedRun:
-    """Run, and end the log with the metrics of what was run.
+    """Run, and end the log, and the live view, with the metrics of what was run.
 
     Args:
         run: fills the log.
         recorder: of the log.
         scenario: that is run.
         layout: of the log's rows.
+        live: the view, which the run fills too.
 
     Raises:
         RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run. Another Ctrl-C
@@ -99,14 +115,20 @@ def run_to_end(
             end()
             wall = time.perf_counter() - started
             info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
-            trace = _finish(recorder, scenario, layout, info)
+            trace = _finish(recorder, scenario, layout, info, live)
             raise RunInterrupted(recorder.path, len(trace), trace) from stop
         end()
-        return LoggedRun(_finish(recorder, scenario, layout, info), recorder.path)
+        return LoggedRun(_finish(recorder, scenario, layout, info, live), recorder.path)
 
 
-def _finish(recorder: McapRecorder, scenario: Scenario, layout: StepLayout, info: RunInfo) -> Trace:
-    """Compute the metrics of what the log holds, and end the log with them."""
+def _finish(
+    recorder: McapRecorder,
+    scenario: Scenario,
+    layout: StepLayout,
+    info: RunInfo,
+    live: LiveView | None,
+) -> Trace:
+    """Compute the metrics of what the log holds, and end log and view with them."""
     recorder.flush()
     if recorder.ticks:
         trace = read_trace(recorder.path)
@@ -120,11 +142,14 @@ def _finish(recorder: McapRecorder, scenario: Scenario, layout: StepLayout, info
     trace = replace(trace, info=replace(info, **written))
     info = replace(trace.info, metrics=compute_metrics(trace))
     recorder.finish(info)
+    if live is not None:
+        live.end(info)
     return replace(trace, info=info)
 
 
-def _open_log(simulation: Simulation, mjcf: Mjcf, out: Path | None, force: bool) -> McapRecorder:
-    scene = Scene(simulation.plant.model)
+def _open_log(
+    simulation: Simulation, scene: Scene, mjcf: Mjcf, out: Path | None, force: bool
+) -> McapRecorder:
     scenario, files = simulation.scenario, read_assets(mjcf)
     if out is not None:
         return McapRecorder(

@@ -139,14 +139,15 @@ class RunInfo:
 class Trace:
     """The columns of a run, e.g. ``trace["q"]`` of shape (N, n), with the scenario it came from.
 
-    >>> from dnnmso_mj import load_scenario, simulate
-    >>> trace = simulate(load_scenario("paper", ["duration=0.1"], controller="pd"))
-    >>> trace["q"].shape  # ticks, joints
-    (100, 2)
-    >>> trace.table().column_names[:5]
-    ['t', 'q1', 'q2', 'qd1', 'qd2']
-    >>> round(trace.metrics["tau_peak"])
-    287
+    Examples:
+        >>> from dnnmso_mj import load_scenario, simulate
+        >>> trace = simulate(load_scenario("paper", ["duration=0.1"], controller="pd"))
+        >>> trace["q"].shape  # ticks, joints
+        (100, 2)
+        >>> trace.table().column_names[:5]
+        ['t', 'q1', 'q2', 'qd1', 'qd2']
+        >>> round(trace.metrics["tau_peak"])
+        287
     """
 
     columns: Mapping[str, Array]

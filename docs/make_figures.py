@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import threading
 from pathlib import Path
 
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.plots import save_figures
 from dnnmso_mj.replay import screenshot
 from dnnmso_mj.run import run_logged
+from dnnmso_mj.viewer.live import connected
+from dnnmso_mj.viewer.process import data_address, free_port, listens, rerun
 
 IMAGES = Path(__file__).parent / "images"
 # Hung up for a moment, loaded, pushed, unloaded, and in the end left to what it knows.
@@ -31,6 +34,7 @@ def main() -> None:
         folder = Path(name)
         draw_figures(folder)
         take_screenshots(folder)
+        draw_live(folder, IMAGES / "live.png")
     for image in sorted(IMAGES.glob("*.png")):
         print(image)
 
@@ -55,6 +59,32 @@ def take_screenshots(folder: Path) -> None:
     for tab in ("Timing", "Scene"):
         screenshot(eventful, IMAGES / f"replay_{tab.lower()}.png", tab=tab)
     screenshot([paper, plain], IMAGES / "replay_compare.png")
+
+
+def draw_live(folder: Path, png: Path, at: int = 6000) -> None:
+    """A viewer without a window in the middle of a run in real time, when `at` ticks are done."""
+    from rerun.experimental import ViewerClient
+
+    port, done = free_port(), 0
+    address = data_address(port)
+
+    def draw() -> None:
+        png.write_bytes(ViewerClient.connect(address).take_screenshot())
+
+    drawing = threading.Thread(target=draw)
+
+    def progress(ticks: int) -> None:
+        nonlocal done
+        before, done = done, done + ticks
+        if before < at <= done:
+            drawing.start()
+
+    with rerun("--headless", "--port", str(port), "--window-size", "1600x900") as viewer:
+        viewer.wait_until(lambda: listens(port), "ready")
+        with connected(address) as live:
+            log = folder / "live.mcap"
+            run_logged(load_scenario("paper"), log, real_time=True, progress=progress, live=live)
+        drawing.join()
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -269,6 +270,31 @@ def test_the_effectiveness_may_be_wrong_within_a_window(make_scenario, two_link,
         settled[g] = trace.info.status == "ok" and worst[4000:].max() < 0.5 * worst[:2000].max()
     assert list(settled.values()) == [radius(g, order) < 1.0 for g in settled]
     assert list(settled.values()) == [False, True, True, False]
+
+
+def continuous(g: float, order: int) -> np.ndarray:
+    """The same loop in continuous time."""
+    e, ed, z, zl = np.eye(4)[:, : 2 + order]
+    w = -GAIN * LAM * e - (GAIN + LAM) * ed - z - (order > 1) * (z - zl)
+    return np.array([ed, g * w, K2 * ((g - 1) * w - z), K2 * (z - zl)][: 2 + order])
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_window_of_a_wrong_effectiveness_is_the_one_on_the_page(order):
+    """docs/theory.md: the polynomials, Hurwitz's least g of each, and the table of limits."""
+    c1, c0 = GAIN + LAM, GAIN * LAM
+    a = [c1 + K2, c0 + K2 * c1, K2 * c0]
+    b = [c1 + 2 * K2, c0 + 2 * K2 * c1 + K2**2, 2 * K2 * c0 + K2**2 * c1, K2**2 * c0]
+    bracket = np.array(a if order == 1 else b)
+    for g in (0.1, 1.0, 3.0):
+        assert np.allclose(np.poly(continuous(g, order)), [1.0, *(g * bracket)], rtol=1e-9)
+    limits = a[2] / (a[0] * a[1]), b[2] ** 2 / (b[0] * (b[1] * b[2] - b[0] * b[3]))
+    least = limits[order - 1]
+    for g, stable in ((0.99 * least, False), (1.01 * least, True), (1e3, True)):
+        assert (np.linalg.eigvals(continuous(g, order)).real.max() < 0) == stable
+    page = (Path(__file__).parents[1] / "docs" / "theory.md").read_text(encoding="utf-8")
+    low, high = window(order)
+    assert f"| {order} | {least:.3f} | {low:.3f} | {high:.0f} |" in page
 
 
 # ---- imperfections ----

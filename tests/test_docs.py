@@ -1,97 +1,153 @@
-"""README and docs: their commands run, their links lead somewhere, their Python works."""
+"""README and docs: their commands run, their links lead somewhere, their Python works.
+
+Commands run in this process, each once, in the order of the pages, in one folder with the logs and
+files that the pages speak of; simulations take coarser steps. test_cli.py calls the program itself.
+"""
 
 from __future__ import annotations
 
 import re
 import shlex
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from vulkan import needs_vulkan
+from typer.testing import CliRunner
+
+from dnnmso_mj.cli import app
+from tests.vulkan import needs_vulkan
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-BIN = Path(sys.executable).parent
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+TEXTS = {str(page.relative_to(ROOT)): page.read_text(encoding="utf-8") for page in PAGES}
+
+COARSER, COARSE = ["--set", "dt=0.005"], ["--set", "dt=0.002"]
+BY_THE_CLOCK = ["--set", "duration=1.2"]
+WRITES_A_TABLE = {"sweep", "compare", "margins", "tune"}
 
 
-def blocks(page: Path, language: str) -> list[str]:
-    pattern = rf"^```{language}\n(.*?)^```"
-    return re.findall(pattern, page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+def cheaper(name: str, words: list[str]) -> list[str]:
+    """Options that make a command cheap without making it another one.
+
+    Fewer ticks and trials, one worker, and no figures, which test_plots.py draws.
+    """
+    if name == "run":
+        return [*(BY_THE_CLOCK if "--real-time" in words else COARSE), "--no-plot"]
+    if name == "check":
+        return ["--states", "100"]
+    if name == "audit":
+        return [*COARSER, "--jobs", "1"]
+    if name not in WRITES_A_TABLE:
+        return []
+    trials = ["--trials", "3"] if name == "tune" else []
+    again = [] if "--resume" in words else ["--force"]  # pages may share a table's name
+    return [*COARSER, "--jobs", "1", *trials, *again]
 
 
-def commands(page: Path, program: str) -> list[list[str]]:
-    lines = [line for block in blocks(page, "sh") for line in block.splitlines()]
+def blocks(text: str, language: str) -> list[str]:
+    """The fenced blocks of a language, without those that are a file's content."""
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+def files(text: str) -> dict[str, str]:
+    """The files that a page has one write, by the titles of its blocks."""
+    titled = r'^```\w+ title="([\w.]+)"\n(.*?)^```'
+    return dict(re.findall(titled, text, re.MULTILINE | re.DOTALL))
+
+
+def commands(program: str, text: str) -> list[str]:
+    lines = [line for block in blocks(text, "sh") for line in block.splitlines()]
     split = [shlex.split(line, comments=True) for line in lines]
-    return [words for words in split if words and words[0] == program]
+    return [shlex.join(words) for words in split if words and words[0] == program]
+
+
+def all_commands(program: str) -> list[str]:
+    """Each command of all pages once, in their order."""
+    return list(dict.fromkeys(line for text in TEXTS.values() for line in commands(program, text)))
+
+
+def is_tried_elsewhere(command: str) -> bool:
+    """Whether it waits for a person (see test_viewer.py), or is what test_bench.py does anyway."""
+    words = shlex.split(command)
+    opens = words[1] == "replay" and not {"--save", "--screenshot"} & set(words)
+    return opens or words[1] == "bench" or bool({"--serve", "--view"} & set(words))
+
+
+def draws(command: str) -> bool:
+    return "--screenshot" in command
 
 
 @pytest.fixture(scope="module")
 def workplace(tmp_path_factory) -> Path:
     """A folder with the logs that the pages speak of, and the files that they have one write."""
     folder = tmp_path_factory.mktemp("workplace")
-    titled = re.compile(
-        r'^```(?:yaml|python) title="([\w.]+)"\n(.*?)^```', re.MULTILINE | re.DOTALL
-    )
-    for page in PAGES:
-        for name, content in titled.findall(page.read_text(encoding="utf-8")):
+    for text in TEXTS.values():
+        for name, content in files(text).items():
             (folder / name).write_text(content, encoding="utf-8")
-    for name in ("paper", "paper_no_network"):
-        short = [BIN / "dnnmso", "run", name, "--set", "duration=0.2", "--no-plot"]
-        subprocess.run(short, cwd=folder, check=True, capture_output=True, timeout=120)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for name in ("paper", "paper_no_network"):
+            CliRunner().invoke(app, ["run", name, "--no-plot"], catch_exceptions=False)
     return folder
 
 
-def run(words: list[str], workplace: Path) -> None:
-    if "--at" in words:
-        words[words.index("--at") + 1] = "0.1"  # the logs here are short
-    command = [BIN / words[0], *words[1:]]
-    done = subprocess.run(
-        command, cwd=workplace, capture_output=True, text=True, check=False, timeout=120
-    )
-    assert done.returncode == 0, (words, done.stderr)
+def invoke(command: str) -> None:
+    """Run a command as it stands, but for what makes it cheaper."""
+    name, *words = shlex.split(command)[1:]
+    words = [*words, *cheaper(name, words)]
+    done = CliRunner().invoke(app, [name, *words], catch_exceptions=False)
+    answers = {0, 1} if name == "diff" else {0}  # 1: the logs differ
+    assert done.exit_code in answers, (command, done.output)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_dnnmso_command_on_the_page_runs(page, workplace):
-    for words in commands(page, "dnnmso"):
-        waits = "--serve" in words or words[1:] == ["replay", "logs/paper.mcap"]
-        # What waits for a person, and what draws, is tried in test_viewer.py and below.
-        if not waits and "--screenshot" not in words:
-            run(words, workplace)
+@pytest.mark.parametrize(
+    "command", [c for c in all_commands("dnnmso") if not is_tried_elsewhere(c) | draws(c)]
+)
+def test_the_command_runs(command, workplace, monkeypatch):
+    monkeypatch.chdir(workplace)
+    invoke(command)
 
 
 @needs_vulkan
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_screenshot_on_the_page_can_be_taken(page, workplace):
-    for words in commands(page, "dnnmso"):
-        if "--screenshot" in words:
-            run(words, workplace)
+@pytest.mark.parametrize("command", [c for c in all_commands("dnnmso") if draws(c)])
+def test_the_screenshot_can_be_taken(command, workplace, monkeypatch):
+    monkeypatch.chdir(workplace)
+    invoke(command)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_make_target_on_the_page_exists(page):
-    for words in commands(page, "make"):
-        dry = ["make", "--dry-run", *words[1:]]
-        done = subprocess.run(dry, cwd=ROOT, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, (words, done.stderr)
+@pytest.mark.parametrize("command", all_commands("make"))
+def test_the_make_target_exists(command):
+    dry = ["make", "--dry-run", *shlex.split(command)[1:]]
+    done = subprocess.run(dry, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_python_block_on_the_page_runs(page, workplace):
-    for block in blocks(page, "python"):
-        subprocess.run([sys.executable, "-c", block], cwd=workplace, check=True, timeout=120)
+@pytest.mark.parametrize("page", [name for name in TEXTS if blocks(TEXTS[name], "python")])
+def test_the_pages_python_runs(page, workplace, monkeypatch):
+    """All blocks of a page, one after the other."""
+    monkeypatch.chdir(workplace)
+    monkeypatch.syspath_prepend(workplace)  # as for a script that stands there
+    names: dict[str, object] = {"__name__": "__page__"}
+    for block in blocks(TEXTS[page], "python"):
+        exec(compile(block, page, "exec"), names)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", TEXTS)
 def test_every_link_on_the_page_leads_to_a_file(page):
-    for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
+    for target in re.findall(r"\]\(([^)#\s]+)", TEXTS[page]):
         if "://" not in target:
-            assert (page.parent / target).exists(), target
+            assert (ROOT / page).parent.joinpath(target).exists(), target
+
+
+def test_every_test_that_a_page_names_exists():
+    code = "".join(file.read_text(encoding="utf-8") for file in (ROOT / "tests").glob("test_*.py"))
+    for page, text in TEXTS.items():
+        for name in re.findall(r"`(test_\w+)`", text):
+            assert f"def {name}(" in code, (page, name)
 
 
 def test_the_readme_does_have_commands_and_pictures():
-    assert len(commands(ROOT / "README.md", "dnnmso")) > 4
-    assert len(commands(ROOT / "README.md", "make")) == 2
-    assert (ROOT / "README.md").read_text(encoding="utf-8").count("![") > 4
+    readme = TEXTS["README.md"]
+    assert len(commands("dnnmso", readme)) > 4
+    assert len(commands("make", readme)) == 2
+    assert readme.count("![") > 4

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -21,6 +20,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 from replay_samples import opened_tabs
+from rerun_programs import children, listening_addresses, ports_of
 from vulkan import needs_vulkan
 
 from dnnmso_mj.errors import DnnmsoError, LogError, MissingExtraError
@@ -187,12 +187,6 @@ def test_a_viewer_that_dies_is_an_error_not_a_traceback(rrd: Path) -> None:
         look_while_it_dies()
 
 
-def children() -> list[int]:
-    """The Rerun programs that this process has started and that still run; each leads a group."""
-    pids = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
-    return [int(pid) for pid in pids if b"rerun_cli" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-
-
 def test_without_a_vulkan_driver_the_message_names_the_packages(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -272,26 +266,6 @@ def lasting_server(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Itera
     """One that no test ends."""
     with serving(log, tmp_path_factory.mktemp("served")) as served:
         yield served
-
-
-def ports_of(address: str) -> tuple[int, int]:
-    """Of the page, and of the data that it loads."""
-    url = urllib.parse.urlsplit(address)
-    data = urllib.parse.parse_qs(url.query)["url"][0]
-    assert data.startswith(f"rerun+http://{LOCAL}:")
-    return int(url.port or 0), int(re.findall(r":(\d+)/proxy", data)[0])
-
-
-def listening_addresses(port: int) -> set[str]:
-    """Local addresses, as the kernel writes them, on which somebody listens at a port."""
-    listening = "0A"
-    return {
-        address
-        for table in ("/proc/net/tcp", "/proc/net/tcp6")
-        for fields in (line.split() for line in Path(table).read_text().splitlines()[1:])
-        for address, hex_port in [fields[1].split(":")]
-        if int(hex_port, 16) == port and fields[3] == listening
-    }
 
 
 def test_a_served_log_is_for_this_machine_only(lasting_server: Server) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dnnmso_mj.cli.live import Port, Serve, View, live_view
 from dnnmso_mj.cli.shared import (
     DIVERGED,
     Json,
@@ -56,30 +57,36 @@ def run(
     real_time: Annotated[
         bool, typer.Option("--real-time", help="Keep to the wall clock, one tick each dt.")
     ] = False,
+    view: View = False,
+    serve: Serve = False,
+    port: Port = 9090,
     plot: Annotated[bool, typer.Option(help="Draw the figures beside the log.")] = True,
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:
-    """Run a scenario headless: log, figures, summary."""
+    """Run a scenario: log, figures, summary."""
     from dnnmso_mj.loading import load_scenario, located
     from dnnmso_mj.run import LoggedRun, run_logged
 
     plot = plot and can_draw()
     sets = [*(overrides or []), *([] if seed is None else [f"seed={seed}"])]
     loaded = load_scenario(scenario, sets, trust=trust)
-    try:
-        with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
-            done = run_logged(loaded, out, force=force, real_time=real_time, progress=progress)
-    except ScenarioError as error:
-        raise located(error, scenario, sets) from error
-    except RunInterrupted as stop:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # all that is left is to say what was run
-        if stop.trace is not None and (stop.ticks or as_json):
-            tell(LoggedRun(stop.trace, stop.log), [], as_json=as_json, real_time=real_time)
-        ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
-        raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
-    figures, undrawn = draw(done) if plot else ([], None)
-    tell(done, figures, as_json=as_json, real_time=real_time)
+    with live_view(view, serve, port) as live:
+        try:
+            with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
+                done = run_logged(
+                    loaded, out, force=force, real_time=real_time, progress=progress, live=live
+                )
+        except ScenarioError as error:
+            raise located(error, scenario, sets) from error
+        except RunInterrupted as stop:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # all that is left is to say what was run
+            if stop.trace is not None and (stop.ticks or as_json):
+                tell(LoggedRun(stop.trace, stop.log), [], as_json=as_json, real_time=real_time)
+            ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
+            raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
+        figures, undrawn = draw(done) if plot else ([], None)
+        tell(done, figures, as_json=as_json, real_time=real_time)
     if undrawn is not None:
         raise undrawn
     if done.trace.info.status == "diverged":

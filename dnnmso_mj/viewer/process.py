@@ -13,6 +13,8 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from signal import SIGHUP, SIGTERM
+from types import FrameType
 from typing import IO, TYPE_CHECKING, TypeVar
 
 from dnnmso_mj.errors import DnnmsoError, MissingExtraError
@@ -26,14 +28,15 @@ LOCAL = "127.0.0.1"  # Rerun's own default, 0.0.0.0, would show the log to the w
 _START_S = 60.0  # a busy machine that draws in software starts a viewer well within it
 _POLL_S = 0.05
 _END_S = 5.0
+_NICE = 10
 # Unlike `python -m rerun_cli` this passes the exit status on, and ends its process group when its
-# standard input does: when we are gone, even if killed.
+# standard input does: when we are gone, even if killed. A word on it lets the group live on.
 _RERUN = """
 import os, signal, sys, threading
 from rerun_cli.__main__ import main
 def follow():
-    sys.stdin.read()
-    os.killpg(0, signal.SIGTERM)
+    if not sys.stdin.read():
+        os.killpg(0, signal.SIGTERM)
 threading.Thread(target=follow, daemon=True).start()
 sys.exit(main())
 """
@@ -52,10 +55,12 @@ def rerun(*arguments: str) -> Iterator[RerunProcess]:
             stderr=messages,
             start_new_session=True,  # a group of its own: Ctrl-C is for us, and we end it all
         )
+        running = RerunProcess(process, messages)
         try:
-            yield RerunProcess(process, messages)
+            yield running
         finally:
-            _end(process)
+            if not running.released:
+                _end(process)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
@@ -76,8 +81,20 @@ class RerunProcess:
     """
 
     def __init__(self, process: subprocess.Popen[bytes], messages: IO[bytes]) -> None:
+        self.released = False
         self._process = process
         self._messages = messages
+
+    def release(self) -> None:
+        """Let it live on when `rerun` is left, and when we are gone."""
+        self.released = True
+        if self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError), self._process.stdin as word:
+                word.write(b"live on")
+
+    def give_way(self) -> None:
+        """Let all else on this machine come first."""
+        os.setpriority(os.PRIO_PGRP, self._process.pid, _NICE)
 
     def wait(self) -> None:
         """Wait for its end.
@@ -131,7 +148,7 @@ def headless_viewer(rrd: Path, size: tuple[int, int]) -> Iterator[ViewerClient]:
 
         def connected() -> ViewerClient | None:
             try:
-                client = ViewerClient.connect(f"rerun+http://{LOCAL}:{port}/proxy")
+                client = ViewerClient.connect(data_address(port))
                 state = client.get_state()
             except (ConnectionError, RuntimeError):  # not yet
                 return None
@@ -173,6 +190,41 @@ def picture(client: ViewerClient) -> bytes:
     if problems:
         raise DnnmsoError("the viewer cannot show all views: " + "; ".join(problems))
     return shown
+
+
+@contextlib.contextmanager
+def until_interrupted() -> Iterator[None]:
+    """Leave the block in good order at Ctrl-C, on SIGTERM, or when the terminal closes."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (SIGTERM, SIGHUP)}
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def check_display(instead: str) -> None:
+    """Refuse to open a window where there can be none.
+
+    Args:
+        instead: what to do then, as an imperative.
+
+    Raises:
+        DnnmsoError: there is no display.
+    """
+    shown = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if sys.platform == "linux" and not shown:
+        raise DnnmsoError(f"no display: neither DISPLAY nor WAYLAND_DISPLAY is set. {instead}")
+
+
+def data_address(port: int) -> str:
+    """Where the viewer that listens at a port of this machine is streamed to."""
+    return f"rerun+http://{LOCAL}:{port}/proxy"
 
 
 def free_port() -> int:
