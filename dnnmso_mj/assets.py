@@ -36,7 +36,8 @@ def put_back(text: str, files: Mapping[str, bytes], folder: Path) -> Mjcf:
     for number, (element, key, path) in enumerate(list(_named(root))):
         data = files.get(PREFIX + path)
         if data is not None:
-            file = folder.resolve() / f"{number}-{Path(path).name}"
+            file = folder.resolve() / str(number) / Path(path).name  # which may name the element
+            file.parent.mkdir(exist_ok=True)
             file.write_bytes(data)
             element.set(key, str(file))
             found = True

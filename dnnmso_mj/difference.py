@@ -190,16 +190,22 @@ def _without(items: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:
 
 
 def _snapshots(a: Recorded, b: Recorded) -> Iterator[str]:
-    """A line for each snapshot that differs."""
-    for tick, name in sorted({*a.snapshots, *b.snapshots}):
-        held = [(tick, name) in recorded.snapshots for recorded in (a, b)]
-        if not all(held):
-            told = _alone(held[0])
-        elif a.snapshots[tick, name] != b.snapshots[tick, name]:
-            told = ", ".join(_arrays(a.arrays(tick, name), b.arrays(tick, name)))
+    """A line for each snapshot that differs; those of the same time are compared."""
+    one, other = ({(_time(r, key), key[1]): key for key in r.snapshots} for r in (a, b))
+    for t, name in sorted({*one, *other}):
+        keys = one.get((t, name)), other.get((t, name))
+        if keys[0] is None or keys[1] is None:
+            told = _alone(keys[0] is not None)
+        elif a.snapshots[keys[0]] != b.snapshots[keys[1]]:
+            told = ", ".join(_arrays(a.arrays(*keys[0]), b.arrays(*keys[1])))
         else:
             continue
-        yield f"{name} at {tick * a.trace.scenario.dt:g} s: {told}"
+        yield f"{name} at {t:g} s: {told}"
+
+
+def _time(recorded: Recorded, key: tuple[int, str]) -> float:
+    """When a snapshot was taken (s), to the nanosecond: steps of two lengths meet there."""
+    return round(key[0] * recorded.trace.scenario.dt, 9)
 
 
 def _arrays(one: Mapping[str, Array], other: Mapping[str, Array]) -> Iterator[str]:

@@ -148,7 +148,10 @@ def packaged_model(name: str) -> Path | None:
     top, *below = package.strip().split(".")
     if not all(part.isidentifier() for part in (top, *below)):
         return None
-    spec = find_spec(top)
+    try:
+        spec = find_spec(top)
+    except ValueError:  # a module that runs or was made by hand, as __main__
+        return None
     folders = (spec.submodule_search_locations if spec else None) or ()
     paths = (Path(folder, *below, file.strip()) for folder in folders)
     return next((path.resolve() for path in paths if _is_file(path)), None)

@@ -10,6 +10,7 @@ import numpy as np
 from dnnmso_mj.branching import code_of, misfit
 from dnnmso_mj.difference import CLOCKED, rows_differ
 from dnnmso_mj.errors import LogError
+from dnnmso_mj.loading.trust import named_code
 from dnnmso_mj.log.segments import Segment
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK
 from dnnmso_mj.plant import Mjcf
@@ -22,6 +23,7 @@ from dnnmso_mj.world_state import EXTERNAL, State
 Array = np.ndarray
 
 SNAPSHOTS = ("controller", "world")
+TRIED = 100  # ticks that a state is tried for
 
 
 class Found(NamedTuple):
@@ -55,7 +57,8 @@ def state_at(source: Recorded, segment: Segment, mjcf: Mjcf, tick: int) -> Found
     simulation = Simulation(segment.scenario, mjcf)
     start = _nearest(source, segment, tick)
     state = _snapshot(source, simulation, start) if start else None
-    if start == tick:
+    if state is not None and start == tick:
+        _try(source, segment, mjcf, state)
         return Found(state, 0, [])
     _refuse_missed(source, start, tick)
     check = _Check(source, simulation.layout, start)
@@ -63,7 +66,24 @@ def state_at(source: Recorded, segment: Segment, mjcf: Mjcf, tick: int) -> Found
     if info.status == "diverged":
         last = (tick - 1) * segment.scenario.dt
         raise LogError(f"{source.path}: {info.reason}; allowed: --at {last:g} or before")
-    return Found(simulation.state(), tick - start, check.events)
+    state = simulation.state()
+    _try(source, segment, mjcf, state)
+    return Found(state, tick - start, check.events)
+
+
+def _try(source: Recorded, segment: Segment, mjcf: Mjcf, state: State) -> None:
+    """Go on from a state as the log does, for a while, in a simulation that was never before it.
+
+    So what code from outside remembers beside its state is missed before anything is written.
+    """
+    later = (part.first for part in source.segments if part.first > state.tick)
+    end = min([state.tick + TRIED, len(source.trace), *later])
+    missed = np.flatnonzero(source.trace["deadline_missed"][state.tick : end])
+    end = state.tick + int(missed[0]) if missed.size else end
+    if end > state.tick:
+        simulation = Simulation(segment.scenario, mjcf)
+        check = _Check(source, simulation.layout, state.tick)
+        simulation.run(check, start=state, until=end)
 
 
 def _nearest(source: Recorded, segment: Segment, tick: int) -> int:
@@ -163,6 +183,10 @@ def _versions(source: Recorded) -> str:
         for name in here
         if name in there and there[name] != here[name]
     ]
-    if not differing:
-        return "It was made with the same versions, so on another kind of processor."
-    return f"It was made with {', '.join(differing)}."
+    if differing:
+        return f"It was made with {', '.join(differing)}."
+    said = "It was made with the same versions, so on another kind of processor"
+    scenarios = [part.scenario for part in source.segments]
+    if any(code_of(each) or any(named_code(each.model_dump())) for each in scenarios):
+        return f"{said}, or its code has changed, or remembers more than its state() gives."
+    return f"{said}."

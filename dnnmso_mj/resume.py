@@ -120,7 +120,7 @@ def _prepare(
 def _tick(source: Recorded, at: float) -> int:
     """The tick nearest to a time in the log."""
     dt, ticks = source.trace.scenario.dt, len(source.trace)
-    if not math.isfinite(at) or not 0 <= round(at / dt) <= ticks:
+    if not math.isfinite(at / dt) or not 0 <= round(at / dt) <= ticks:
         raise LogError(f"{source.path}: --at {at:g}: allowed: 0 to {ticks * dt:g} s, its end")
     return round(at / dt)
 

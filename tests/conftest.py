@@ -21,6 +21,9 @@ from dnnmso_mj.scenario import Scenario
 ROOT = Path(__file__).parents[1]
 LOCKS = "DNNMSO_TEST_LOCKS"
 
+# Workers share the cores: torch's threads would wait for one another.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile once, before workers start: no test of a command line sees the notice that it does.

@@ -6,7 +6,8 @@ from pathlib import Path
 
 LAWS = '''
 import numpy as np
-from collections import deque
+from collections import deque, namedtuple
+from dataclasses import dataclass
 
 
 class Pd:
@@ -36,6 +37,39 @@ class Remembers(Pd):
         self.first = self.past[0] if self.first is None else self.first
         self.pair = (self.pair[0] + 1, "some")
         return super().update(inputs) - 200.0 * self.integral + self.drawn + sum(self.past)
+
+
+class Slotted:
+    """Tuples in lists and dicts, in attributes that are in no dict."""
+
+    __slots__ = ("past", "sums", "rng")
+
+    def __init__(self, setup):
+        self.past, self.sums, self.rng = [(0.0, 0.0)], {"e": (0.0,)}, setup.rng
+
+    def update(self, inputs):
+        e, ed = inputs.q - inputs.q_ref, inputs.qd - inputs.qd_ref
+        q1, q2, one = self.past[-1] + (1.0,)
+        self.past = [*self.past, (float(e[0]), float(e[1]))][-3:]
+        self.sums = {"e": (*self.sums["e"][-2:], q1 + q2)}
+        return -512.0 * e - 128.0 * ed - one * sum(self.sums["e"] + (self.rng.random(),))
+
+
+@dataclass(frozen=True)
+class Frozen:
+    setup: object
+    kp: float = 512.0
+
+    def update(self, inputs):
+        return -self.kp * (inputs.q - inputs.q_ref) - 128.0 * (inputs.qd - inputs.qd_ref)
+
+
+class Named(Pd):
+    """What JSON would give back as a mere tuple."""
+
+    def __init__(self, setup):
+        super().__init__(setup)
+        self.gains = namedtuple("Gains", "kp")(3.0)
 
 
 class Same:

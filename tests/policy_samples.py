@@ -43,6 +43,16 @@ class Counter:
         self.ticks = int(state["ticks"][0])
 
 
+class Secretive:
+    """Remembers how often it was called, and does not say so."""
+
+    ticks = 0
+
+    def __call__(self, observation):
+        self.ticks += 1
+        return np.full(2, 1e-3 * self.ticks)
+
+
 def sour(observation):
     raise RuntimeError("a policy of no use")
 

@@ -13,6 +13,8 @@ from log_samples import LAYOUT, OK, append_all, recorder, rows
 
 from dnnmso_mj.difference import difference, rows_differ
 from dnnmso_mj.errors import LogError
+from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.run import run_logged
 from dnnmso_mj.trace import Event, RunInfo, StepLayout
 
 COLUMN = LAYOUT.slices
@@ -120,6 +122,14 @@ def test_columns_of_other_widths_are_told_and_the_rest_compared(tmp_path):
     found = difference(one, other)
     assert found.widths["weight_norm"] == (4, 0)
     assert not found.columns
+
+
+def test_snapshots_of_the_same_time_are_compared_whatever_the_steps(tmp_path):
+    logs = tmp_path / "one.mcap", tmp_path / "other.mcap"
+    for log, dt in zip(logs, (0.001, 0.002), strict=True):
+        run_logged(load_scenario("paper", ["controller={kind: pd}", "duration=1", f"dt={dt}"]), log)
+    told = [text.split(":")[0] for text in difference(*logs).snapshots]
+    assert told == ["world at 1 s"]  # the laws have no memory
 
 
 def test_the_command_says_it_and_so_does_its_exit_status(tmp_path):

@@ -22,7 +22,7 @@ from gymnasium.utils.env_checker import check_env
 from dnnmso_mj.controllers import Inputs, build_controller
 from dnnmso_mj.environments import dm
 from dnnmso_mj.environments.gym import ID, TrackingEnv
-from dnnmso_mj.errors import ScenarioError
+from dnnmso_mj.errors import DnnmsoError, ScenarioError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.paths import find_model
@@ -397,6 +397,14 @@ def test_what_no_environment_can_be_made_of_is_refused():
             make(load_scenario("paper"), ("duration=1",))
     with pytest.raises(ScenarioError, match='render_mode = human; allowed: None or "rgb_array"'):
         TrackingEnv("paper", render_mode="human")
+
+
+def test_an_action_of_another_shape_is_refused():
+    env = TrackingEnv("setpoint", SHORT)
+    env.reset()
+    for action in (0.5, [0.5], [0.5, 0.5, 0.5]):
+        with pytest.raises(DnnmsoError, match=r"an action of shape \(.*; allowed: \(2,\)"):
+            env.step(np.array(action))
 
 
 def test_options_that_do_not_exist_are_refused():

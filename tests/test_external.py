@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -131,6 +132,7 @@ def test_its_state_is_in_the_log_and_reading_that_imports_nothing(laws):
         ("Wide", "Wide.update gives an array (3,); allowed: a torque (N·m) (2,)"),
         ("Breaks", "Breaks.update fails: ZeroDivisionError: division by zero"),
         ("Queues", "Queues has an attribute past of deque, which no log can hold; allowed:"),
+        ("Named", "Named has an attribute gains of Gains, which no log can hold; allowed:"),
         ("Forgets", "Forgets has state alone; allowed: state and restore, or neither"),
         ("Untold", "Untold.update gives ndarray; allowed: a Command"),
     ],
@@ -439,8 +441,11 @@ def test_a_robot_of_a_package_is_found_without_importing_it(name, package):
     check_same(simulate(scenario), simulate(load_scenario("paper", [SHORT], controller="pd")))
 
 
-@pytest.mark.parametrize("name", ["outside_package:arm.xml", "no_package:arm.xml", "a b:c", ":x"])
-def test_a_robot_that_is_not_there_is_refused_with_what_is(name, package):
+@pytest.mark.parametrize(
+    "name", ["outside_package:arm.xml", "no_package:arm.xml", "a b:c", ":x", "made_by_hand:x"]
+)
+def test_a_robot_that_is_not_there_is_refused_with_what_is(name, package, monkeypatch):
+    monkeypatch.setitem(sys.modules, "made_by_hand", ModuleType("made_by_hand"))  # as __main__
     with pytest.raises(ScenarioError, match=r"allowed: an MJCF file, .*two_link, outside_arm; or"):
         load_scenario("paper", [f"plant.model={json.dumps(name)}"])
 

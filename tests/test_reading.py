@@ -238,8 +238,9 @@ REFUSALS: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSALS)
-def test_what_is_no_log_is_refused_with_one_message(tmp_path, case):
+def test_what_is_no_log_is_refused_with_one_message(tmp_path, case, monkeypatch):
     make, message = REFUSALS[case]
+    monkeypatch.chdir(tmp_path)  # where no other logs are
     path = tmp_path / "run.mcap"
     make(path)
     with pytest.raises(LogError, match=message) as refusal:
@@ -249,8 +250,9 @@ def test_what_is_no_log_is_refused_with_one_message(tmp_path, case):
 
 
 @pytest.mark.parametrize("case", [c for c in REFUSALS if "message" not in c and c != "no tick"])
-def test_recover_refuses_what_is_no_log_and_leaves_nothing(tmp_path, case):
+def test_recover_refuses_what_is_no_log_and_leaves_nothing(tmp_path, case, monkeypatch):
     make, message = REFUSALS[case]
+    monkeypatch.chdir(tmp_path)
     make(tmp_path / "run.mcap")
     with pytest.raises(LogError, match=message):
         recover(tmp_path / "run.mcap", tmp_path / "out.mcap")

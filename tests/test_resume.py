@@ -272,7 +272,8 @@ def test_another_model_is_kept_in_the_log_and_so_is_the_one_before(tmp_path):
     """Its mesh too: a log alone is gone on from."""
     shape = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
     text = (ROOT / "models" / "two_link.xml").read_text()
-    mesh = '<asset><mesh name="hand" file="hand.obj" inertia="legacy"/></asset><worldbody>'
+    # Without a name of its own it has its file's.
+    mesh = '<asset><mesh file="hand.obj" inertia="legacy"/></asset><worldbody>'
     geom = '<geom name="hand" type="mesh" mesh="hand" mass="0"/><site name="tip"'
     folder = tmp_path / "arms"
     (folder / "parts").mkdir(parents=True)
@@ -308,6 +309,27 @@ def test_code_from_outside_goes_on_too_if_it_is_trusted(tmp_path):
     assert resume(log, 0.3, [other], trust=True).told == ""
     gone = resume(log, 0.3, ["imperfections.external=[]"], trust=True).run.trace
     assert np.array_equal(gone["q_meas"][300:], gone["q"][300:])
+
+
+@pytest.mark.parametrize("name", ["Slotted", "Frozen"])
+def test_what_a_law_remembers_comes_back_as_it_was_wherever_it_keeps_it(name, tmp_path):
+    (tmp_path / "laws.py").write_text(LAWS)
+    sets = [f"controller={{kind: external, python: '{tmp_path}/laws.py:{name}'}}", "duration=0.1"]
+    log = run_logged(load_scenario("paper", sets, trust=True), tmp_path / "run.mcap").log
+    again = resume(log, 0.03, out=tmp_path / "again.mcap", trust=True).run.log
+    assert difference(log, again).equal
+
+
+@pytest.mark.parametrize("at", [0.001, 0.12])
+def test_code_that_remembers_more_than_it_says_is_not_gone_on_with(at, tmp_path):
+    (tmp_path / "policies.py").write_text(SOURCE)
+    code = f"{tmp_path}/policies.py:Secretive"
+    sets = [f"controller={{kind: policy, python: '{code}'}}", "duration=0.2"]
+    log = run_logged(load_scenario("paper", sets, trust=True), tmp_path / "run.mcap").log
+    out = tmp_path / "again.mcap"
+    with pytest.raises(LogError, match=rf"tick {round(at / 1e-3)} .*remembers more than its state"):
+        resume(log, at, out=out, trust=True)
+    assert not out.exists()
 
 
 def test_a_policy_goes_on_from_what_it_remembers(tmp_path):
@@ -435,7 +457,7 @@ def test_a_log_is_not_replaced_by_what_goes_on_from_it(pd):
         resume(pd, 0.3, out=pd.with_name("there.mcap"))
 
 
-@pytest.mark.parametrize("at", [-0.1, 1.41, float("nan"), float("inf")])
+@pytest.mark.parametrize("at", [-0.1, 1.41, 1e308, float("nan"), float("inf")])
 def test_a_time_that_the_log_has_not_is_refused(pd, at):
     with pytest.raises(LogError, match=r"--at .*: allowed: 0 to 1\.4 s, its end"):
         on(pd, at)

@@ -133,9 +133,17 @@ class Episode:
         return out
 
     def torque(self, action: Array) -> Array:
-        """The torque (n,) N·m of an action (n,)."""
-        tau = np.empty(self.scenario.n_joints)
-        torque(np.asarray(action, dtype=float), self.scale, tau)
+        """The torque (n,) N·m of an action (n,).
+
+        Raises:
+            DnnmsoError: the action has another shape.
+        """
+        tau, asked = np.empty(self.scenario.n_joints), np.asarray(action, dtype=float)
+        if asked.shape != tau.shape:
+            raise DnnmsoError(
+                f"an action of shape {asked.shape}; allowed: {tau.shape}, one number a joint"
+            )
+        torque(asked, self.scale, tau)
         return tau
 
     def hold(self, tau: Array, ticks: int) -> float:
