@@ -45,6 +45,16 @@ def recorder(out: Path) -> Iterator[str]:
     with rerun("--port", str(port), "--save", str(out)) as process:
         process.wait_until(lambda: listens(port), "ready")
         yield data_address(port)
+        wait_until_written(out)
+
+
+def wait_until_written(file: Path) -> None:
+    """Until a Rerun program has put into a file what it has got: it is ended without mercy."""
+    size, since = -1, time.monotonic()
+    while time.monotonic() < since + 1.5:
+        if size != (size := file.stat().st_size):
+            since = time.monotonic()
+        time.sleep(0.1)
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +96,7 @@ def test_a_burst_of_many_ticks_arrives_whole_in_a_viewer_that_outlives_the_run(t
         [group] = children()
         run_logged(scenario, tmp_path / "run.mcap", live=view)
     assert is_running(group)
+    wait_until_written(tmp_path / "live.rrd")
     os.killpg(group, signal.SIGTERM)
     wait_until(lambda: not is_running(group))
     angles = contents(tmp_path / "live.rrd")["/plots/joint_angles/lines"]["Scalars:scalars"]
