@@ -22,6 +22,12 @@ def read_assets(mjcf: Mjcf) -> dict[str, bytes]:
     return files
 
 
+def named_files(text: str, files: Mapping[str, bytes]) -> dict[str, bytes]:
+    """Of a log's attachments, those that the MJCF `text` names."""
+    names = [PREFIX + path for _, _, path in _named(_root(text))]
+    return {name: files[name] for name in names if name in files}
+
+
 def put_back(text: str, files: Mapping[str, bytes], folder: Path) -> Mjcf:
     """A model whose files are in a folder.
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dnnmso_mj.assets import named_files
 from dnnmso_mj.log.format import MODEL
 from dnnmso_mj.log.segments import RESUMED, SEGMENTS, Segment, segments_record
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK
@@ -94,7 +95,7 @@ class Continuation:
                 name = MODEL if own else f"model-{part.first}.xml"
                 segments.append(replace(part, model=name))
                 if not own:
-                    files |= {name: text, **self.source.assets}
+                    files |= {name: text, **named_files(text.decode(), self.source.files)}
         return [*segments, replace(self.last, model=MODEL)] if segments else [], files
 
 

@@ -57,6 +57,7 @@ class Difference:
         status: what each says of its end, where they differ.
         events: of the first log alone, and of the second.
         snapshots: what differs in the states kept, in words.
+        files: attachments that differ: models, and what they name.
         clocked: columns of the wall clock that differ; not counted.
         versions: what each was made with, where they differ; not counted.
     """
@@ -68,6 +69,7 @@ class Difference:
     status: tuple[str, str] | None
     events: tuple[tuple[str, ...], tuple[str, ...]]
     snapshots: tuple[str, ...]
+    files: tuple[str, ...]
     clocked: tuple[ColumnDifference, ...]
     versions: Mapping[str, tuple[str, str]]
 
@@ -81,6 +83,7 @@ class Difference:
             or self.status
             or any(self.events)
             or self.snapshots
+            or self.files
         )
 
     def plain(self) -> dict[str, Any]:
@@ -122,6 +125,7 @@ def difference(one: Path, other: Path) -> Difference:
         status=(ends[0], ends[1]) if ends[0] != ends[1] else None,
         events=_events(a, b),
         snapshots=tuple(_snapshots(a, b)),
+        files=tuple(n for n in sorted({*a.files, *b.files}) if a.files.get(n) != b.files.get(n)),
         clocked=tuple(c for c in columns if c.name in CLOCKED),
         versions=_versions(a, b),
     )

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from mcap.records import Attachment
 
-from dnnmso_mj.assets import PREFIX
 from dnnmso_mj.errors import LogError
 from dnnmso_mj.log.format import snapshot_arrays, snapshot_place
 from dnnmso_mj.log.prefix import Prefix
@@ -51,11 +50,6 @@ class Recorded:
         except ValueError as error:
             t = tick * self.trace.scenario.dt
             raise LogError(f"{self.path}: the snapshot {name} of {t:g} s is {error}") from error
-
-    @property
-    def assets(self) -> dict[str, bytes]:
-        """The files that its models name, by the names of their attachments."""
-        return {name: data for name, data in self.files.items() if name.startswith(PREFIX)}
 
     def segment(self, tick: int) -> Segment:
         """The one that a tick belongs to."""

@@ -189,7 +189,7 @@ def _scene(log: Recorded) -> Scene:
     scenario = log.trace.scenario
     try:
         with tempfile.TemporaryDirectory() as folder:
-            mjcf = put_back(data.decode(), log.assets, Path(folder))
+            mjcf = put_back(data.decode(), log.files, Path(folder))
             spec = build_spec(scenario.plant, scenario.dt, mjcf)
             return Scene(compile_spec(spec, scenario.plant.model))
     except (ScenarioError, UnicodeDecodeError) as error:

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from dnnmso_mj.assets import put_back, read_assets
+from dnnmso_mj.assets import named_files, put_back, read_assets
 from dnnmso_mj.branching import branch
 from dnnmso_mj.continuing import Continuation, Model
 from dnnmso_mj.errors import LogError, ScenarioError
-from dnnmso_mj.loading.changing import change_scenario
+from dnnmso_mj.loading.changing import MODEL, change_scenario
+from dnnmso_mj.loading.overrides import parse_overrides
 from dnnmso_mj.log.segments import Segment
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
@@ -84,14 +85,14 @@ def resume(
             f"duration = {scenario.duration:g}: ends before --at {at:g}; allowed: {at:g} or more"
         )
     with TemporaryDirectory(prefix="dnnmso-") as folder:
-        rest, checked = _prepare(source, tick, scenario, ", ".join(sets), Path(folder))
+        rest, checked = _prepare(source, tick, scenario, sets, Path(folder))
         where = {"source": log.name, "at": repr(at), "sets": json.dumps(list(sets))}
         done = rest.record(out or _free_name(log, tick * scenario.dt), where, force, progress)
     return Resumed(done, tick, checked, rest.last.told if rest.last.first == tick else "")
 
 
 def _prepare(
-    source: Recorded, tick: int, scenario: Scenario, changes: str, folder: Path
+    source: Recorded, tick: int, scenario: Scenario, sets: Sequence[str], folder: Path
 ) -> tuple[Continuation, int]:
     """What is left to run, and how many ticks before it were computed again.
 
@@ -99,20 +100,20 @@ def _prepare(
         source: the log.
         tick: of it, to go on from.
         scenario: to go on in.
-        changes: in words.
+        sets: `--set` strings that made it; a model that they name is the file as it is now.
         folder: for the files of models.
     """
     segment = source.segment(tick)
     own = _model(source, segment, folder)
-    same = scenario.plant.model == segment.scenario.plant.model
-    model = own if same else _model_file(scenario.plant.model)
+    named = any(item.covers(MODEL) for item in parse_overrides(sets))
+    model = _model_file(scenario.plant.model) if named else own
     simulation = Simulation(scenario, model.mjcf)
     state, checked, events = state_at(source, segment, own.mjcf, tick)
-    if scenario != segment.scenario:
+    if scenario != segment.scenario or model[1:] != own[1:]:
         told = ""
         if state is not None:
             state, became = branch(state, segment.scenario, simulation)
-            told = f"resumed from {source.path.name} with {changes}; {became}"
+            told = f"resumed from {source.path.name} with {', '.join(sets)}; {became}"
         segment = Segment(tick, scenario, told=told)
     return Continuation(source, tick, events, segment, state, simulation, model), checked
 
@@ -131,7 +132,8 @@ def _model(source: Recorded, segment: Segment, folder: Path) -> Model:
     if data is None:
         raise LogError(f"{source.path}: has no attachment {segment.model}; it cannot be resumed")
     text = data.decode()
-    return Model(put_back(text, source.assets, folder), text, source.assets)
+    files = named_files(text, source.files)
+    return Model(put_back(text, files, folder), text, files)
 
 
 def _model_file(name: str) -> Model:

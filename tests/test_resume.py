@@ -292,6 +292,22 @@ def test_another_model_is_kept_in_the_log_and_so_is_the_one_before(tmp_path):
     assert difference(pd, on(again, 0.05).run.log).equal
 
 
+def test_a_model_that_is_named_again_is_the_file_as_it_is_now(tmp_path):
+    file = tmp_path / "arm.xml"
+    text = (ROOT / "models" / "two_link.xml").read_text()
+    file.write_text(text)
+    log = log_of(tmp_path, [PD[0], f"plant.model={file}", "duration=0.3"])
+    same = on(log, 0.1, f"plant.model={file}", name="same").run.log
+    assert difference(log, same).equal
+    file.write_text(text.replace('model="two_link"', 'model="renamed"'))
+    assert file.read_text() != text
+    other = difference(log, on(log, 0.1, f"plant.model={file}", name="other").run.log)
+    assert set(other.files) == {"model.xml", "model-0.xml"}
+    assert not other.equal
+    assert not other.columns
+    assert difference(log, on(log, 0.1, name="own").run.log).equal
+
+
 def test_code_from_outside_goes_on_too_if_it_is_trusted(tmp_path):
     (tmp_path / "laws.py").write_text(LAWS)
     sets = [

@@ -149,6 +149,8 @@ def _other_differences(found: Difference) -> Iterator[str]:
     yield from (f"snapshot {text}" for text in found.snapshots[:MOST_TOLD])
     if len(found.snapshots) > MOST_TOLD:
         yield f"and {len(found.snapshots) - MOST_TOLD} more in snapshots"
+    if found.files:
+        yield f"files in the log: {', '.join(found.files)}"
     apart = [column.name for column in found.clocked]
     if apart:
         yield f"not counted, of the wall clock: {', '.join(apart)}"
