@@ -94,8 +94,8 @@ def _refill(ring: Array, size: int, tick: int) -> Array:
 
 def _start_bounds(simulation: Simulation, tick: int) -> None:
     """Begin at the present error; the next tick, ending a period that had no bounds, adds to it."""
-    plant, bounds = simulation.plant, simulation.world.bounds
-    q_ref, qd_ref, _ = simulation.reference.sample(np.array([tick * simulation.scenario.dt]))
+    plant, bounds = simulation.plant, simulation.stage.world.bounds
+    q_ref, qd_ref, _ = simulation.stage.reference.sample(np.array([tick * simulation.scenario.dt]))
     error = np.concatenate([plant.q, plant.qd]) - np.concatenate([q_ref[0], qd_ref[0]])
     start_bounds(bounds, error)
     _undo_decay(bounds)

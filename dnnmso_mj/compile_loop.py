@@ -98,10 +98,10 @@ def main() -> None:
     ticks = compiled_ticks(simulation.controller)
     with event.install_listener("numba:compile", CompileNotice()):
         if halves:
-            for half, arguments in _halves(simulation.world):
+            for half, arguments in _halves(simulation.stage.world):
                 half.compile(tuple(map(half.typeof_pyval, arguments)))
         elif ticks is not None:
-            ticks.run(simulation.world, ticks.parts, 0, 0)
+            ticks.run(simulation.stage.world, ticks.parts, 0, 0)
 
 
 if __name__ == "__main__":

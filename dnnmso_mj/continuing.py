@@ -16,10 +16,11 @@ from dnnmso_mj.log.segments import RESUMED, SEGMENTS, Segment, segments_record
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.recorded import Recorded
+from dnnmso_mj.recorder import Recorder
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.run import LoggedRun, run_to_end
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulation import Progress, Recorder, Simulation
+from dnnmso_mj.simulation import Progress, Simulation
 from dnnmso_mj.trace import Event, RunInfo, StepLayout
 from dnnmso_mj.world_state import State
 

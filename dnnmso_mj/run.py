@@ -22,7 +22,8 @@ from dnnmso_mj.realtime import left_in_peace, real_time_pace
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scene import Scene
-from dnnmso_mj.simulation import AS_FAST_AS_CAN_BE, Progress, Simulation
+from dnnmso_mj.simulation import Progress, Simulation
+from dnnmso_mj.stage import AS_FAST_AS_CAN_BE
 from dnnmso_mj.tee import Tee
 from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dnnmso_mj.simulation import Recorder
+from dnnmso_mj.recorder import Recorder
 from dnnmso_mj.trace import Event
 
 Array = np.ndarray

@@ -155,7 +155,7 @@ def test_friction_is_the_plants_alone(make_scenario, two_link):
     scenario = make_scenario(imperfections={"friction": {"viscous": 3.0}})
     simulation = Simulation(scenario, two_link)
     assert simulation.plant.model.dof_damping.tolist() == [3.0, 3.0]
-    assert simulation._nominal.model.dof_damping.tolist() == [0.0, 0.0]
+    assert simulation.stage._nominal.model.dof_damping.tolist() == [0.0, 0.0]
     assert Simulation(make_scenario(), two_link).plant.model.dof_damping.tolist() == [0.0, 0.0]
 
 

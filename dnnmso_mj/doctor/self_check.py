@@ -78,7 +78,9 @@ def check() -> dict[str, Any]:
     scenario = load_scenario("paper", [f"duration={DURATION}"])
     simulation = Simulation(scenario, mjcf)
     ticks = compiled_ticks(simulation.controller)
-    compiled = ticks is not None and is_compiled(ticks.run, (simulation.world, ticks.parts, 0, 0))
+    compiled = ticks is not None and is_compiled(
+        ticks.run, (simulation.stage.world, ticks.parts, 0, 0)
+    )
     one, two = simulate(scenario, mjcf), simulate(scenario, mjcf)
     differ = [key for key in one if key not in MEASURED and not np.array_equal(one[key], two[key])]
     return {

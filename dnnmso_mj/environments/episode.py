@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
@@ -11,7 +10,6 @@ import numpy as np
 
 from dnnmso_mj.compile_loop import compile_halves_elsewhere
 from dnnmso_mj.consistency import MULTIPLE, is_multiple
-from dnnmso_mj.controllers import Command, Inputs
 from dnnmso_mj.controllers.measured import empty_command, show_measured
 from dnnmso_mj.errors import DnnmsoError, NonFiniteError, ScenarioError
 from dnnmso_mj.loading import load_scenario
@@ -19,10 +17,10 @@ from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import Metrics, compute_metrics
 from dnnmso_mj.observation import PARTS, observe, torque, torque_scale
 from dnnmso_mj.paths import find_model
-from dnnmso_mj.plant import Mjcf
+from dnnmso_mj.plant import Mjcf, Plant
 from dnnmso_mj.scenario import Policy, Scenario
-from dnnmso_mj.simulation import Simulation
-from dnnmso_mj.trace import Event, RunInfo, Trace
+from dnnmso_mj.stage import Stage
+from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
 
 Array = np.ndarray
 
@@ -37,31 +35,6 @@ def outside() -> None:
         DnnmsoError: always.
     """
     raise DnnmsoError("the torques of this run came from outside, and its scenario has them not")
-
-
-class FromOutside:
-    """The controller of an episode: it commands what it is given."""
-
-    n_layers = 0
-
-    def __init__(self, n_joints: int) -> None:
-        self.command = empty_command(n_joints)
-
-    def reset(self, x: Array) -> None:
-        """It has no memory."""
-
-    def update(self, inputs: Inputs) -> Command:
-        show_measured(self.command, inputs.x)
-        return self.command
-
-    def dynamics(self, x: Array) -> Array:
-        return np.zeros(x.size // 2)
-
-    def state(self) -> dict[str, Array]:
-        return {}
-
-    def restore(self, state: Mapping[str, Array]) -> None:
-        """It has no memory."""
 
 
 class Episode:
@@ -81,7 +54,7 @@ class Episode:
         error: why it was reached before its time; "" otherwise.
 
     Raises:
-        ScenarioError: as `load_scenario` and `Simulation`.
+        ScenarioError: as `load_scenario` and `Stage`.
     """
 
     def __init__(
@@ -97,12 +70,12 @@ class Episode:
         each = None if scale is None else _positive(scale, scenario.n_joints)
         scenario = _driven_from_outside(scenario, each)
         self.scale = torque_scale(scenario, each)
-        self._outside = FromOutside(scenario.n_joints)
+        self._command = empty_command(scenario.n_joints)
         mjcf = Mjcf.read(find_model(scenario.plant.model))
         self.scenario = scenario
-        self._simulation = Simulation(scenario, mjcf, controller=self._outside)
-        self.plant = self._simulation.plant
-        compile_halves_elsewhere(self._simulation.world, scenario, mjcf)
+        self.plant = Plant(scenario, mjcf)
+        self._stage = Stage(scenario, mjcf, self.plant, StepLayout(scenario.n_joints, n_layers=0))
+        compile_halves_elsewhere(self._stage.world, scenario, mjcf)
         self.over, self.error = True, ""
 
     @property
@@ -118,18 +91,18 @@ class Episode:
                 reference alone: see `start.episode_scenario`.
         """
         self.scenario = scenario
-        self._recorder = MemoryRecorder(self._simulation.layout, scenario.n_ticks)
+        self._recorder = MemoryRecorder(self._stage.layout, scenario.n_ticks)
         self.over, self.error = False, ""
         self._began, self._tick = time.perf_counter(), 0
-        self._simulation.vary(scenario)
-        self._simulation.begin()
+        self._stage.vary(scenario)
+        self._stage.start()
         self._open_block()
-        self._simulation.sense(0)
+        self._stage.sense(0)
 
     def observation(self) -> Array:
         """What is told of the present tick: a new vector (6n,); see `observation`."""
         out = np.empty(len(PARTS) * self.scenario.n_joints)
-        observe(self._simulation.world.inputs, out)
+        observe(self._stage.world.inputs, out)
         return out
 
     def torque(self, action: Array) -> Array:
@@ -173,7 +146,7 @@ class Episode:
         if self.error:
             return 0.0
         n = self.scenario.n_joints
-        e, share = self._simulation.world.e_track[:n], self._outside.command.tau / self.scale
+        e, share = self._stage.world.e_track[:n], self._command.tau / self.scale
         near = 1.0 / (1.0 + float(e @ e) / PRECISION**2)
         return near * max(0.0, 1.0 - EFFORT * float(share @ share) / n)
 
@@ -184,7 +157,7 @@ class Episode:
     def trace(self) -> Trace:
         """The episode so far, as `simulate` returns a run."""
         if not self.over:
-            self._simulation.close_block(self._recorder)
+            self._stage.close_block(self._recorder)
             self._open_block()
         status = "diverged" if self.error else "ok" if self.over else "unfinished"
         wall = time.perf_counter() - self._began
@@ -197,30 +170,30 @@ class Episode:
 
     def _advance(self, tau: Array) -> None:
         """One tick from its command on, and the next one up to what is told of it."""
-        simulation = self._simulation
-        command = self._outside.update(simulation.world.inputs)
-        command.tau[:] = tau
+        stage = self._stage
+        show_measured(self._command, stage.world.inputs.x)
+        self._command.tau[:] = tau
         try:
-            if simulation.act(self._tick, command):
-                simulation.close_block(self._recorder)
-                self._end_early(simulation.divergence())
+            if stage.act(self._tick, self._command):
+                stage.close_block(self._recorder)
+                self._end_early(stage.divergence())
                 return
             self._tick += 1
             self.over = self._tick == self.scenario.n_ticks
             if self._tick == self._block_end:
-                simulation.close_block(self._recorder)
+                stage.close_block(self._recorder)
                 self._open_block()
-            simulation.sense(self._tick)
+            stage.sense(self._tick)
         except NonFiniteError as error:  # of an imperfection from outside
-            simulation.close_block(self._recorder)
+            stage.close_block(self._recorder)
             self._end_early(error)
 
     def _open_block(self) -> None:
-        """Rows are kept block by block, as `Simulation.run` does; what is due now happens."""
-        self._block_end = self._simulation.open_block(self._recorder)
+        """Rows are kept block by block, as a run's are; what is due now happens."""
+        self._block_end = self._stage.open_block(self._recorder)
 
     def _end_early(self, error: NonFiniteError) -> None:
-        self._tick = self._simulation.tick
+        self._tick = self._stage.tick
         self.over, self.error = True, f"{error} at t = {self.t:.6g} s"
         self._recorder.event(Event(self.t, "error", f"diverged: {self.error}"))
 
