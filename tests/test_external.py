@@ -399,7 +399,7 @@ def test_the_controller_begins_with_the_reading_of_the_first_tick(laws, two_link
 
 
 def test_one_goes_on_from_its_state(laws, two_link):
-    one, other = (Simulation(spoil("Noisy"), two_link).hooks for _ in range(2))
+    one, other = (Simulation(spoil("Noisy"), two_link).stage.hooks for _ in range(2))
     x = np.zeros(4)
     for _ in range(3):
         one.sense(0.0, x)

@@ -87,7 +87,7 @@ def test_another_seed_is_another_run_even_without_a_network(simulation, make_sce
 
 
 def test_by_default_nothing_is_imperfect(make_scenario, two_link):
-    world = Simulation(make_scenario(), two_link).world
+    world = Simulation(make_scenario(), two_link).stage.world
     assert world.sensors.perfect
     assert world.actuators.prompt
     assert not world.loads.acting

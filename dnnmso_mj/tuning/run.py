@@ -100,11 +100,7 @@ def tune(
         Study(storage, name, *trials, resume=resume, force=force) as study,
     ):
         kept = study.n_done
-        if kept > request.trials:
-            allowed = f"allowed: {kept} or more, or --force to start anew"
-            raise TuneError(
-                f"--trials {request.trials}: {storage} has {kept} trials already; {allowed}"
-            )
+        _refuse_fewer(request.trials, kept, storage)
         if watcher is not None:
             watcher.begin(request.trials, kept)
         try:
@@ -141,6 +137,12 @@ def _check(request: Request, resume: bool, force: bool) -> None:
         if item.path in CHOICES:
             where = f"{item.place}: chooses a controller"
             raise TuneError(f"{where}, as --controller does; allowed: --controller alone")
+
+
+def _refuse_fewer(trials: int, kept: int, storage: Path) -> None:
+    if kept > trials:
+        allowed = f"allowed: {kept} or more, or --force to start anew"
+        raise TuneError(f"--trials {trials}: {storage} has {kept} trials already; {allowed}")
 
 
 def _one_trial(study: Study, search: Search, pool: WorkerPool, watcher: Watcher | None) -> None:

@@ -25,7 +25,7 @@ from dnnmso_mj.viewer.ring import Ring
 from dnnmso_mj.viewer.rrd import APPLICATION
 from dnnmso_mj.viewer.stream import RunStream
 
-_LOOK_S = 0.1  # between two looks at the ring: eyes need no more
+_LOOK_S = 0.2  # between two looks at the ring: each makes the viewer draw, beside the loop
 _BATCH_BYTES = 2 * 2**20  # sent at once: so small that the run's end sees each as a sign of life
 _NICE = 10  # the loop comes first
 
