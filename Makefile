@@ -7,11 +7,14 @@ PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint const
 SCENARIO ?= scenarios/paper.yaml
 PYTEST_ARGS ?=
 
-.PHONY: help run test check format figures experiments schema docs build clean
+SOAK_ARGS = $(if $(ROW),--row $(ROW)) $(if $(SEED),--seed $(SEED)) $(if $(SHORT),--short)
+
+.PHONY: help run test soak check format figures experiments schema docs build clean
 
 help:
 	@echo "make run      install, run $(SCENARIO), print where the log and the figures are"
 	@echo "make test     install what the tests need and run them all"
+	@echo "make soak     prove what docs/reliability.md says, in under two hours; ROW=5 one row of it"
 	@echo "make check    format, lint and type checks"
 	@echo "make format   format and fix what can be fixed"
 	@echo "make figures  draw the pictures of the README and docs anew"
@@ -26,6 +29,9 @@ run: $(VENV)/.installed-run
 
 test: $(VENV)/.installed-test
 	$(BIN)/python -m pytest --numprocesses logical --dist loadfile $(PYTEST_ARGS)
+
+soak: $(VENV)/.installed-test
+	PYTHONPATH=tests $(BIN)/python -m soak $(SOAK_ARGS)
 
 check: $(VENV)/.installed-check
 	$(BIN)/ruff format --check .
