@@ -26,6 +26,7 @@ from dnnmso_mj.scene import Scene
 from dnnmso_mj.sources import python_path
 from dnnmso_mj.trace import Event, RunInfo, StepLayout
 from dnnmso_mj.viewer.process import (
+    LOCAL,
     RerunProcess,
     check_display,
     data_address,
@@ -177,19 +178,25 @@ def window() -> Iterator[LiveView]:
 
 
 @contextmanager
-def served(port: int) -> Iterator[LiveView]:
-    """A view for browsers on this machine alone, also after the block, until Ctrl-C.
+def served(port: int, bind: str = LOCAL) -> Iterator[LiveView]:
+    """A view for browsers, also after the block, until Ctrl-C.
 
-    The page's address is printed on standard error.
+    The page's address is printed on standard error, and who reaches it beside this machine.
+
+    Args:
+        port: of the page.
+        bind: the IP address to listen on.
 
     Raises:
         DnnmsoError: the port is taken, or the server cannot start.
         MissingExtraError: rerun is not installed.
     """
     require("viewer", "the viewer")
-    with web_server(port) as server:
+    with web_server(port, bind=bind) as server:
         server.process.give_way()
         print(f"live     {server.page}", file=sys.stderr, flush=True)
+        if server.exposed:
+            print(server.exposed, file=sys.stderr, flush=True)
         with connected(server.data) as live:
             yield live
         print("The page stays until Ctrl-C.", file=sys.stderr, flush=True)
