@@ -13,7 +13,7 @@ from dnnmso_mj.errors import LogError
 from dnnmso_mj.log.format import create, snapshot_place, unwritable
 from dnnmso_mj.log.npz import read_npz
 from dnnmso_mj.log.prefix import Prefix, copy
-from dnnmso_mj.log.scan import scan
+from dnnmso_mj.log.scan import scan, scan_trace
 from dnnmso_mj.log.segments import RESUMED
 from dnnmso_mj.log.writer import LogWriter
 from dnnmso_mj.paths import find_log
@@ -63,7 +63,7 @@ def read_trace(path: str | Path) -> Trace:
     Raises:
         LogError: the file is no log of this package, or holds not one tick.
     """
-    return scan(find_log(path), steps=True).trace()
+    return scan_trace(find_log(path))[1]
 
 
 def log_info(path: str | Path) -> LogInfo:

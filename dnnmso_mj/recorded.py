@@ -12,7 +12,7 @@ from mcap.records import Attachment
 from dnnmso_mj.errors import LogError
 from dnnmso_mj.log.format import snapshot_place
 from dnnmso_mj.log.npz import read_npz
-from dnnmso_mj.log.scan import scan
+from dnnmso_mj.log.scan import scan_trace
 from dnnmso_mj.log.segments import Segment, read_segments
 from dnnmso_mj.trace import StepLayout, Trace
 
@@ -72,8 +72,7 @@ def read_recorded(path: Path) -> Recorded:
         else:
             snapshots[place] = record.data
 
-    log = scan(path, steps=True, files=keep)
-    trace = log.trace()
+    log, trace = scan_trace(path, keep)
     try:
         segments = read_segments(log.metadata, trace.scenario)
     except ValueError as error:

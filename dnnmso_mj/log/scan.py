@@ -16,56 +16,12 @@ from dnnmso_mj.log.format import EVENTS, STEP, event_of, run_info
 from dnnmso_mj.log.json_texts import check_json
 from dnnmso_mj.log.messages import Messages
 from dnnmso_mj.log.prefix import Prefix, Record
-from dnnmso_mj.log.step_message import StepFormat, check_schema, layout_of
+from dnnmso_mj.log.rows import Kept, Rows, Take
+from dnnmso_mj.log.step_message import check_schema
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.trace import Event, RunInfo, Trace
 
 Array = np.ndarray
-
-BLOCK = 4096  # messages that are decoded at once
-
-
-class Steps:
-    """The rows of a log, made of its messages as they come.
-
-    Args:
-        size: of the file (bytes), which bounds how many there may be.
-    """
-
-    def __init__(self, size: int) -> None:
-        self._most, self._most_odd = limits.rows(size), limits.odd_steps(size)
-        self._format: StepFormat | None = None
-        self._data = bytearray()  # grows in place: a long log is in memory once
-        self._count = 0
-
-    def add(self, messages: Messages) -> None:
-        """Take the next messages.
-
-        Raises:
-            ValueError: one is no `dnnmso.Step`, or unlike the first; or there are too many.
-        """
-        if messages.data.shape[1] > limits.STEP:
-            raise ValueError(f"a message of {messages.data.shape[1]} bytes; {limits.STEP} at most")
-        if self._format is None:
-            self._format = StepFormat(layout_of(messages.data[0].tobytes()))
-        for first in range(0, len(messages), BLOCK):
-            self._add(self._format, messages.data[first : first + BLOCK])
-
-    def columns(self) -> dict[str, Array] | None:
-        """The columns so far; None without a message."""
-        if self._format is None:
-            return None
-        layout = self._format.layout
-        return layout.columns(np.frombuffer(self._data).reshape(-1, layout.width))
-
-    def _add(self, form: StepFormat, data: Array) -> None:
-        count = self._count + len(data)
-        if 8 * form.layout.width * count > self._most:
-            raise ValueError(f"more than {self._most} bytes of numbers, too much for its size")
-        self._data += form.decode(data, self._count).tobytes()
-        self._count = count
-        if form.odd > self._most_odd:
-            raise ValueError(f"more than {self._most_odd} messages of another program's layout")
 
 
 @dataclass
@@ -74,7 +30,7 @@ class Scan:
 
     path: Path
     size: int
-    steps: Steps | None = None
+    take: Take | None = None
     complete: bool = False
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -84,7 +40,7 @@ class Scan:
     events: list[Event] = field(default_factory=list)
     ticks: int = 0
     _event_bytes: int = 0
-    _numbered: bool = True  # whether the messages on /step are
+    _rows: Rows | None = None
 
     def error(self, problem: str) -> LogError:
         return LogError(f"{self.path}: {problem}.")
@@ -110,10 +66,11 @@ class Scan:
             if not self.ticks:
                 self._check_schema(channel)
             self.ticks += len(messages)
-            self._numbered = int(messages.sequence[-1]) == self.ticks - 1
         try:
-            if channel.topic == STEP.name and self.steps is not None:
-                self.steps.add(messages)
+            if channel.topic == STEP.name and self.take is not None:
+                self._rows = self._rows or Rows(self.scenario(), self.size)
+                for layout, rows in self._rows.decode(messages):
+                    self.take(layout, rows)
             elif channel.topic == EVENTS.name:
                 self._add_events(messages.data)
         except ValueError as error:
@@ -132,11 +89,7 @@ class Scan:
         Raises:
             LogError: it has no scenario, or no channel /step of ours.
         """
-        if "json" not in self.metadata.get("scenario", {}):
-            raise self.error(
-                "no metadata record 'scenario': an MCAP of another program, or a run killed "
-                "before its log began. Logs are what `dnnmso run` writes"
-            )
+        self._scenario_text()
         step = next((c for c in self.channels.values() if c.topic == STEP.name), None)
         if step is None:
             topics = ", ".join(sorted(c.topic for c in self.channels.values())) or "none"
@@ -159,7 +112,7 @@ class Scan:
             raise self.error(f"{error}. Read it with {self._writer()}") from error
 
     def scenario(self) -> Scenario:
-        text = self.metadata["scenario"]["json"]
+        text = self._scenario_text()
         try:
             check_json(text)
         except ValueError as error:
@@ -181,35 +134,24 @@ class Scan:
             raise self.error(f"a metadata record is damaged: {error}. Run it again") from error
         return info if self.complete else replace(info, status="unfinished")
 
-    def trace(self) -> Trace:
-        """All ticks, once `steps` has taken them.
+    def trace(self, columns: dict[str, Array] | None) -> Trace:
+        """The log as a trace of these columns.
 
         Raises:
-            LogError: there is none, or they are not those of the scenario.
+            LogError: there is none.
         """
-        columns = self.steps.columns() if self.steps else None
         if columns is None:
             raise self.error("holds no tick: the run ended before its first. Run it again")
-        scenario, t = self.scenario(), columns["t"]
-        joints = columns["q"].shape[1]
-        if joints != scenario.n_joints:
-            raise self.error(
-                f"{joints} joints on {STEP.name}; its scenario has {scenario.n_joints}. "
-                "Run the scenario again"
-            )
-        self._check_times(t, scenario.dt)
-        return Trace(columns, scenario, self.run(), tuple(self.events))
+        return Trace(columns, self.scenario(), self.run(), tuple(self.events))
 
-    def _check_times(self, t: Array, dt: float) -> None:
-        """Numbers of messages say that none is missing; without them the ticks' times must."""
-        far = np.inf if self._numbered else dt / 4
-        wrong = ~(np.abs(t - dt * np.arange(len(t))) < far)
-        if wrong.any():
-            k = int(wrong.argmax())
+    def _scenario_text(self) -> str:
+        text = self.metadata.get("scenario", {}).get("json")
+        if text is None:
             raise self.error(
-                f"tick {k} is of t = {t[k]:g} s; expected {k * dt:g} s: ticks are missing, or not "
-                "in their order. Run the scenario again"
+                "no metadata record 'scenario': an MCAP of another program, or a run killed "
+                "before its log began. Logs are what `dnnmso run` writes"
             )
+        return text
 
     def _writer(self) -> str:
         """The program that wrote the log, as far as it says."""
@@ -217,20 +159,20 @@ class Scan:
 
 
 def scan(
-    path: Path, *, steps: bool = False, files: Callable[[Attachment], None] | None = None
+    path: Path, take: Take | None = None, files: Callable[[Attachment], None] | None = None
 ) -> Scan:
     """Read a log once, complete or torn.
 
     Args:
         path: the file.
-        steps: whether its ticks are kept, for `Scan.trace`.
+        take: takes the rows of its ticks.
         files: takes the attachments.
 
     Raises:
         LogError: the file is no log of this package.
     """
     prefix = Prefix(path)
-    log = Scan(path, prefix.size, Steps(prefix.size) if steps else None)
+    log = Scan(path, prefix.size, take)
     for record in prefix:
         log.add(record)
         if files is not None and isinstance(record, Attachment):
@@ -238,3 +180,14 @@ def scan(
     log.complete = prefix.complete
     log.check()
     return log
+
+
+def scan_trace(path: Path, files: Callable[[Attachment], None] | None = None) -> tuple[Scan, Trace]:
+    """Read a log once, with all of its ticks.
+
+    Raises:
+        LogError: the file is no log of this package, or holds not one tick.
+    """
+    kept = Kept(Prefix(path).size)
+    log = scan(path, kept.add, files)
+    return log, log.trace(kept.columns())
