@@ -16,6 +16,16 @@ SETTLING_DWELL = 0.1  # of the run: an error that merely crosses zero at the end
 BOUND_MARGIN = 1.01  # the bound is of continuous time, the loop is sampled
 BOUND_ROUNDING = 1e-9  # rad
 
+# What a run must have come to its end for.
+WHOLE = (
+    "rmse",
+    "rmse_steady",
+    "max_abs_error_steady",
+    "tau_chatter",
+    "f_err_rms_steady",
+    "settling_time",
+)
+
 
 def compute_metrics(trace: Trace) -> Metrics:
     """All metrics of a run; the names are a contract with `--json`, sweeps and logs.
@@ -33,12 +43,21 @@ def compute_metrics(trace: Trace) -> Metrics:
             half (rad/s and rad/s²).
         settling_time: see `settling_time` (s).
         bound_violations: see `bound_violations` (ticks).
-        diverged: whether the run was stopped because it left the plausible range.
+        diverged: whether the run was stopped because it left the plausible range, or a limit of
+            its joints.
         compute_us_p50, compute_us_p999: percentiles 50 and 99.9 of the controller's time (µs).
         deadline_misses: ticks without a command in time, whatever the cause; see `timing`.
 
-        None stands for what is not defined: too few ticks, or a column that is not finite.
+        None stands for what is not defined: too few ticks, or a column that is not finite; and for
+        every mean, steady value and settling of a run that diverged, in `WHOLE`, since the part
+        that was run is no smaller run. Largest values and counts are of the ticks that there are.
     """
+    found = _of_what_was_run(trace)
+    lost = WHOLE if found["diverged"] else ()
+    return found | dict.fromkeys(lost)
+
+
+def _of_what_was_run(trace: Trace) -> Metrics:
     half = len(trace) // 2
     error = trace["q"] - trace["q_ref"]
     f_err = trace["f_true"][half:] - trace["f_hat"][half:]

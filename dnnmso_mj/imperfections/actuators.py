@@ -25,6 +25,8 @@ DECAY, INPUT, STATE = range(3)
 # Rows of `Actuators.held`.
 GIVEN, LAGGED = range(2)
 
+ROUNDING = 1e-12  # of a mean of two torques, in parts of it; a few times more than it can be
+
 
 class Actuators(NamedTuple):
     """The drives, each joint with its own limits."""
@@ -112,7 +114,8 @@ def _limit(tau_cmd: Array, limits: Array, held: Array, tau: Array) -> bool:
 def _respond(k: int, limits: Array, held: Array, past: Array, parts: Array, tau: Array) -> None:
     """Delay and lag: from tick k's command in `tau` to its period's mean.
 
-    A mean of torques within the limit is within it, but for rounding, which is cut off.
+    A mean of torques within the limit is within it, but for rounding, which is cut off; what is
+    further out, or no number, was not made here and must be seen.
     """
     size = len(past)
     whole = size - 2
@@ -123,6 +126,7 @@ def _respond(k: int, limits: Array, held: Array, past: Array, parts: Array, tau:
             u = past[(k - whole - 1 + part) % size, i]
             mean += u * parts[part, INPUT] + (y - u) * parts[part, STATE]
             y = u + (y - u) * parts[part, DECAY]
-        if abs(mean) > limits[0, i]:
-            mean = math.copysign(limits[0, i], mean)
+        most = limits[0, i]
+        if most < abs(mean) < most * (1.0 + ROUNDING):
+            mean = math.copysign(most, mean)
         tau[i], held[LAGGED, i] = mean, y
