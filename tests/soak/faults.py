@@ -15,6 +15,7 @@ from dnnmso_mj.controllers.dnn_mso import DnnMsoController
 from dnnmso_mj.imperfections.actuators import GIVEN, LAGGED
 from dnnmso_mj.imperfections.loads import FRICTION
 from dnnmso_mj.kernel import learn, output_at
+from dnnmso_mj.monitors import Monitors
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.run import LoggedRun, run_to_end
@@ -27,7 +28,6 @@ Rng = np.random.Generator
 # What a controller has learned, and what its optimiser keeps, by its name in a `state()`.
 LEARNED = ("weights", "mean_weights", "theta", "W", "V")
 OPTIMISER = ("second_moment", "first_moment")
-OTHER = ("x_hat", "integral", "d_hat", "sigma", "zeta", "z")
 SEEN = ("qpos", "qvel", "ctrl", "qfrc_applied")
 
 
@@ -63,7 +63,7 @@ class Fault:
     """One value in one place before tick k.
 
     Args:
-        where: "sensor", "weights", "optimiser", "gradient", "torque", "force" or "state".
+        where: "sensor", "weights", "optimiser", "observer", "gradient", "torque", "force", "state".
         tick: k, before which it is put there.
         value: not finite, or so large that it soon makes something not finite.
         entry: which of the places there are, from 0 to 1.
@@ -90,15 +90,21 @@ def _sensor(simulation: Simulation, fault: Fault) -> None:
     _into(error[fault.tick % len(error), :-1], fault)
 
 
-def _kept(names: tuple[str, ...]) -> Callable[[Simulation, Fault], None]:
-    def strike(simulation: Simulation, fault: Fault) -> None:
-        state = simulation.controller.state()
-        found = [name for name in names if name in state and state[name].size]
-        with np.errstate(over="ignore"):
-            _into(state[found[int(fault.entry * 7919) % len(found)]], fault)
-            simulation.controller.restore(state)
+def _kept(simulation: Simulation, fault: Fault) -> None:
+    state = simulation.controller.state()
+    names = places(state)[fault.where]
+    with np.errstate(over="ignore"):
+        _into(state[names[int(fault.entry * 7919) % len(names)]], fault)
+        simulation.controller.restore(state)
 
-    return strike
+
+def places(state: Mapping[str, Array]) -> dict[str, list[str]]:
+    """The arrays of a controller's state that each kind of fault may go to."""
+    real = [name for name, values in state.items() if values.dtype.kind == "f" and values.size]
+    learned = [name for name in real if name in LEARNED]
+    moments = [name for name in real if name in OPTIMISER]
+    rest = [name for name in real if name not in {*LEARNED, *OPTIMISER, *Monitors._fields}]
+    return {"weights": learned, "optimiser": moments, "observer": rest}
 
 
 def _torque(simulation: Simulation, fault: Fault) -> None:
@@ -130,9 +136,9 @@ def _state(simulation: Simulation, fault: Fault) -> None:
 
 STRIKES: Mapping[str, Callable[[Simulation, Fault], None]] = {
     "sensor": _sensor,
-    "weights": _kept(LEARNED),
-    "optimiser": _kept(OPTIMISER),
-    "observer": _kept(OTHER),
+    "weights": _kept,
+    "optimiser": _kept,
+    "observer": _kept,
     "torque": _torque,
     "force": _force,
     "state": _state,
