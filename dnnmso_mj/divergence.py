@@ -46,7 +46,7 @@ def why_it_ended(world: World, layout: StepLayout) -> NonFiniteError:
             "torque beside the motors'", f"{torque}, above {MUJOCO_ZEROES_ABOVE:g}"
         )
     if status == STATE_NOT_FINITE:
-        return _of_state(world.x, "")
+        return _of_state(np.concatenate([world.plant.q, world.plant.qd]), "")
     if status == READING_NOT_FINITE:
         return _of_state(world.inputs.x, "_meas")
     return _of_row(world, layout)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from dnnmso_mj.clock import now_ns, sleep_until
-from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.compiling import compiled, copy, inner, is_finite
 from dnnmso_mj.imperfections.actuators import GIVEN, Actuators, actuate
 from dnnmso_mj.imperfections.loads import BEFORE, Loads, load
 from dnnmso_mj.imperfections.sensors import Sensors, sense
@@ -212,6 +212,8 @@ def _drive(world: World, tau: Array) -> bool:
             status = TAU_NOT_FINITE
         elif abs(tau[j]) > MUJOCO_ZEROES_ABOVE and status == RUNNING:
             status = TAU_TOO_LARGE
+    if not (is_finite(world.plant.q) and is_finite(world.plant.qd)):
+        status = STATE_NOT_FINITE  # changed from outside since the tick began
     if status == RUNNING and not load(world.loads, world.plant, tau, world.dt, MUJOCO_ZEROES_ABOVE):
         status = LOAD_TOO_LARGE
     world.counts[STATUS] = status

@@ -17,7 +17,7 @@ from soak.faults import LEARNED, OPTIMISER, Fault, Struck
 LAST = 100  # states before the fault that the log must hold
 TORQUES = ("tau", "tau_cmd")
 STATES = ("q", "qd", "|q|", "|qd|", "|qdd|")
-# What a message may name first, of each place: what was put there, or what the next tick made of it.
+# What a message may name first: what was put there, or what the next tick made of it.
 NAMES: Mapping[str, tuple[str, ...]] = {
     "sensor": ("q_meas", "qd_meas", "tau", "tau_cmd"),
     "torque": ("tau",),

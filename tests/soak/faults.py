@@ -1,4 +1,4 @@
-"""Put a value that is not finite into a run, at a tick and a place; and watch what MuJoCo is given."""
+"""Put what is not finite into a run, at a tick and a place; and watch what MuJoCo is given."""
 
 from __future__ import annotations
 
