@@ -39,6 +39,15 @@ class RunInterrupted(KeyboardInterrupt):
         self.trace = trace
 
 
+class UnloggedRunError(LogError):
+    """A run that ended because its log could not be written; `trace` holds what the log does."""
+
+    def __init__(self, why: str, log: Path, trace: Trace) -> None:
+        super().__init__(why)
+        self.log = log
+        self.trace = trace
+
+
 class NonFiniteError(DnnmsoError):
     """A quantity that left the finite range, or grew past every plausible value, during a run."""
 

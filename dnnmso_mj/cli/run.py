@@ -24,7 +24,13 @@ from dnnmso_mj.cli.shared import (
     progress_bar,
     working,
 )
-from dnnmso_mj.errors import DnnmsoError, MissingExtraError, RunInterrupted, ScenarioError
+from dnnmso_mj.errors import (
+    DnnmsoError,
+    MissingExtraError,
+    RunInterrupted,
+    ScenarioError,
+    UnloggedRunError,
+)
 from dnnmso_mj.extras import require
 
 if TYPE_CHECKING:
@@ -33,6 +39,7 @@ if TYPE_CHECKING:
     from dnnmso_mj.trace import Trace
 
 MISSES_SHOWN = 20
+ENDED_EARLY = ("interrupted", "failed")
 UNITS = {
     "rmse": "rad",
     "rmse_steady": "rad",
@@ -85,6 +92,9 @@ def run(
                 tell(LoggedRun(stop.trace, stop.log), [], as_json=as_json, real_time=real_time)
             ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
             raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
+        except UnloggedRunError as error:
+            tell(LoggedRun(error.trace, error.log), [], as_json=as_json, real_time=real_time)
+            raise
         figures, undrawn = draw(done) if plot else ([], None)
         tell(done, figures, as_json=as_json, real_time=real_time)
     if undrawn is not None:
@@ -112,7 +122,8 @@ def draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
 
     try:
         with working("drawing figures"):
-            return save_figures(done.trace, done.log.parent, done.log.stem), None
+            name = done.log.name.removesuffix(".mcap")
+            return save_figures(done.trace, done.log.parent, name), None
     except DnnmsoError as error:
         return [], error
 
@@ -153,7 +164,7 @@ def print_summary(trace: Trace, log: Path, figures: list[Path], since: int = 0) 
         table.add_row(name, number(value), UNITS.get(name, ""))
     print_table(table, soft_wrap=True)
     simulated = (len(trace) - since) * trace.scenario.dt
-    whole = f" of {trace.scenario.duration:g} s" if info.status == "interrupted" else ""
+    whole = f" of {trace.scenario.duration:g} s" if info.status in ENDED_EARLY else ""
     print(f"{simulated:g} s{whole} simulated in {info.wall_s:.2f} s")
     print(f"log      {near(log)}")
     for figure in figures:
