@@ -94,7 +94,7 @@ class McapRecorder:
                 raise
         except OSError as error:
             raise unwritable(self.path, error) from error
-        self._most = _ticks_in_a_block(scenario.dt, real_time)
+        self._most = ticks_in_a_block(scenario.dt, real_time)
         self._block = min(self._most, FEW_TICKS)
         self._given_at = time.perf_counter()
         row = 8 * layout.width
@@ -222,7 +222,7 @@ class McapRecorder:
             raise unwritable(self.path, error) from error
 
 
-def _ticks_in_a_block(dt: float, real_time: bool) -> int:
+def ticks_in_a_block(dt: float, real_time: bool) -> int:
     """As many as a kill may cost, twice and a bit; without deadlines not too few to go fast."""
     ticks = int((PACED_BLOCK_S if real_time else BLOCK_S) / dt + 1e-9)
     return min(MOST_TICKS, max(1 if real_time else FEW_TICKS, ticks))
