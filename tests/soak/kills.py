@@ -118,9 +118,11 @@ def undisturbed(folder: Path) -> Known:
 
 
 def _life(known: Known, folder: Path) -> float:
-    """How long a forked run lives (s), from its start to its end."""
+    """How long a forked run lives (s), from the beginning of its log to its end."""
+    log = folder / "life.mcap"
+    process = start(run_reporting, FAST, str(log), str(folder / "life"))
+    wait_for(log.exists)
     began = time.monotonic()
-    process = start(run_reporting, FAST, str(folder / "life.mcap"), str(folder / "life"))
     process.join()
     return time.monotonic() - began
 
@@ -128,14 +130,14 @@ def _life(known: Known, folder: Path) -> float:
 def kill_run(known: Known, life: float, place: Path, rng: np.random.Generator) -> Loss | None:
     """At any instant of its life."""
     process, page, log = _begin(place, FAST)
-    time.sleep(rng.uniform(0.0, life))
+    _wait(rng, log, life)
     return _cost(process, page, log, known.fast)
 
 
 def kill_paced(known: Known, place: Path, rng: np.random.Generator) -> Loss | None:
     """At any instant of its life, by the wall clock."""
     process, page, log = _begin(place, PACED, real_time=True)
-    time.sleep(rng.uniform(0.0, 1.9))
+    _wait(rng, log, 1.7)
     return _cost(process, page, log, known.paced, paced=True)
 
 
@@ -236,6 +238,15 @@ def _begin(
     log, page = place / "run.mcap", place.parent / f"{place.name}.{place.parent.name}.page"
     shared = Page(page)
     return start(run_reporting, sets, str(log), str(page), real_time, force), shared, log
+
+
+def _wait(rng: np.random.Generator, log: Path, life: float) -> None:
+    """Until an instant of a run's life: now and then before its log is there, mostly after."""
+    if rng.random() < 0.2:
+        time.sleep(rng.uniform(0.0, 0.5))
+    else:
+        wait_for(log.exists)
+        time.sleep(rng.uniform(0.0, life))
 
 
 def _cost(
