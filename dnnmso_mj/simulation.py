@@ -155,13 +155,13 @@ class Simulation:
             EndedEarlyError: the run ends before them; rows of before are recorded.
         """
         stage, snapshot_every = self.stage, self.snapshot_every
-        most = min(getattr(recorder, "block", BLOCK), LARGEST_BLOCK)
         stage.world.counts[START_NS] = time.monotonic_ns() + HEAD_START_NS
         while stage.tick < n_ticks:
             first = stage.tick
             if first % snapshot_every == 0:
                 self._check_controller()
                 self._give_state(recorder)
+            most = min(getattr(recorder, "block", BLOCK), LARGEST_BLOCK)
             end = min(stage.open_block(recorder, most), n_ticks)
             count = min(end, (first // snapshot_every + 1) * snapshot_every) - first
             self._run_block(first, count, recorder)
