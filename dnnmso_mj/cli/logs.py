@@ -19,14 +19,14 @@ def plot(
 ) -> None:
     """Draw the paper's figures and the theory from logs; several are compared."""
     require("plot", "dnnmso plot")
+    from dnnmso_mj.logged import read_drawn
     from dnnmso_mj.plots import save_comparison, save_figures
-    from dnnmso_mj.reading import read_trace
 
     folder = out or logs[0].parent
     names = [log.stem for log in logs]
     if len(set(names)) < len(names):
         names = [f"{k}-{name}" for k, name in enumerate(names, start=1)]
-    traces = [read_trace(log) for log in logs]
+    traces = [read_drawn(log) for log in logs]
     figures = []
     with working("drawing figures"):
         # First what may be refused, so that nothing is left behind.
