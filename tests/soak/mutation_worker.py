@@ -46,6 +46,7 @@ LEFT_OUT = (
 F = TypeVar("F", bound=Callable[..., Any])
 
 TESTS = Path(__file__).parents[1]
+NO_TESTS = "conftest.py"
 KILLED, BROKEN = 1, 3  # exit statuses
 MEMORY_BYTES = 2**30  # that a mutant may take beside what is imported
 LEAST_S, TIMES = 5.0, 10.0  # time limit: so long, and so many times what the tests take unchanged
@@ -124,7 +125,7 @@ class Trial:
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         usual: dict[tuple[str, ...], float] = {}
         for file, source, tests in self.orders:
-            items = [item for test in tests for item in session.items if _named(item, test)]
+            items = [item for test in tests for item in _named(session.items, test)]
             if tuple(tests) not in usual:
                 started = time.monotonic()
                 _protocol(items)  # imports and caches whatever these tests need
@@ -147,12 +148,15 @@ class Trial:
 
 
 def _protocol(items: list[pytest.Item]) -> None:
-    for item, following in zip(items, [*items[1:], None], strict=True):
+    for item, following in zip(items, [*items, None][1:], strict=True):
         item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
 
 
-def _named(item: pytest.Item, test: str) -> bool:
-    return item.nodeid.removeprefix("tests/").startswith(test)
+def _named(items: list[pytest.Item], test: str) -> list[pytest.Item]:
+    found = [item for item in items if item.nodeid.removeprefix("tests/").startswith(test)]
+    if not found:
+        raise pytest.UsageError(f"no test is named {test}")
+    return found
 
 
 def _leave(status: int, why: str) -> None:
@@ -225,10 +229,10 @@ def run(orders: list[tuple[str, str, list[str]]], folder: Path) -> list[dict[str
         phases=[hypothesis.Phase.explicit, hypothesis.Phase.generate],
     )
     hypothesis.settings.load_profile("mutation")
-    files = sorted({test.partition("::")[0] for _, _, tests in orders for test in tests})
+    files = {test.partition("::")[0] for _, _, tests in orders for test in tests}
     trial = Trial(orders, folder)
     options = ["-p", "no:cacheprovider", "-p", "no:xdist", "-p", "no:faulthandler", "--capture=no"]
-    options += [f"--rootdir={TESTS.parent}", *(str(TESTS / file) for file in files)]
+    options += [f"--rootdir={TESTS.parent}", *(str(TESTS / file) for file in sorted(files or {NO_TESTS}))]
     options.append(f"--basetemp={folder}")
     options += [f"--deselect=tests/{name}" for name in LEFT_OUT]
     status = pytest.main(options, plugins=[trial])
