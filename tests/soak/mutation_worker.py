@@ -1,6 +1,6 @@
 """Runs tests against mutants: a process that imports and collects once, and forks for each mutant.
 
-As a program: mutation_worker.py ORDERS VERDICTS, two JSON files.
+As a program: mutation_worker.py ORDERS VERDICTS; the first a JSON list, the other JSON lines.
 
 Compiled functions run as the plain Python they are written in, and MuJoCo's functions through
 ctypes, for a mutant that had to be compiled would take half a minute. That compiled code does the
@@ -113,14 +113,17 @@ class Trial:
 
     Args:
         orders: mutants as (file, source, tests), the tests as beginnings of their names.
+        verdicts: the file that each one's is written to, a line of JSON.
         folder: where tests put their files.
     """
 
-    def __init__(self, orders: list[tuple[str, str, list[str]]], folder: Path) -> None:
+    def __init__(
+        self, orders: list[tuple[str, str, list[str]]], verdicts: Path, folder: Path
+    ) -> None:
         self.orders = orders
+        self.verdicts = verdicts
         self.folder = folder
         self.failed = ""
-        self.verdicts: list[dict[str, Any]] = []
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         usual: dict[tuple[str, ...], float] = {}
@@ -135,7 +138,9 @@ class Trial:
                 gc.collect()
                 gc.freeze()
             limit = LEAST_S + TIMES * usual[tuple(tests)]
-            self.verdicts.append(_verdict(items, file, source, limit))
+            verdict = _verdict(items, file, source, limit)
+            with self.verdicts.open("a") as out:
+                out.write(f"{json.dumps(verdict)}\n")
             for made in self.folder.glob("*"):
                 shutil.rmtree(made, ignore_errors=True)
         return True
@@ -195,7 +200,6 @@ def _try(
     global _OUT  # noqa: PLW0603
     _OUT = out
     gc.disable()
-    os.setpgid(0, 0)
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.setitimer(signal.ITIMER_REAL, limit)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -218,8 +222,8 @@ def _try(
     _leave(0, "")
 
 
-def run(orders: list[tuple[str, str, list[str]]], folder: Path) -> list[dict[str, Any]]:
-    """Verdicts of the mutants, in their order."""
+def run(orders: list[tuple[str, str, list[str]]], verdicts: Path) -> None:
+    """Write the verdicts of the mutants, in their order."""
     hypothesis.settings.register_profile(
         "mutation",
         derandomize=True,
@@ -229,23 +233,20 @@ def run(orders: list[tuple[str, str, list[str]]], folder: Path) -> list[dict[str
         phases=[hypothesis.Phase.explicit, hypothesis.Phase.generate],
     )
     hypothesis.settings.load_profile("mutation")
+    folder = verdicts.parent / "tests"
     files = {test.partition("::")[0] for _, _, tests in orders for test in tests}
-    trial = Trial(orders, folder)
     options = ["-p", "no:cacheprovider", "-p", "no:xdist", "-p", "no:faulthandler", "--capture=no"]
-    options += [f"--rootdir={TESTS.parent}", *(str(TESTS / file) for file in sorted(files or {NO_TESTS}))]
-    options.append(f"--basetemp={folder}")
+    options += [f"--rootdir={TESTS.parent}", f"--basetemp={folder}"]
     options += [f"--deselect=tests/{name}" for name in LEFT_OUT]
-    status = pytest.main(options, plugins=[trial])
-    if len(trial.verdicts) != len(orders):
-        raise SystemExit(f"pytest ended with status {status}")
-    return trial.verdicts
+    options += [str(TESTS / file) for file in sorted(files or {NO_TESTS})]
+    pytest.main(options, plugins=[Trial(orders, verdicts, folder)])
 
 
 def main() -> None:
     os.environ["DNNMSO_SKIP_WARM_UP"] = "1"
     interpret()
-    orders = json.loads(Path(sys.argv[1]).read_text())
-    Path(sys.argv[2]).write_text(json.dumps(run(orders, Path(sys.argv[2]).parent / "tests")))
+    orders, verdicts = map(Path, sys.argv[1:])
+    run(json.loads(orders.read_text()), verdicts)
 
 
 if __name__ == "__main__":
