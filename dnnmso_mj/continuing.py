@@ -13,12 +13,13 @@ import numpy as np
 from dnnmso_mj.assets import named_files
 from dnnmso_mj.log.format import MODEL
 from dnnmso_mj.log.segments import RESUMED, SEGMENTS, Segment, segments_record
+from dnnmso_mj.logged import LoggedRun
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.recorded import Recorded
 from dnnmso_mj.recorder import Recorder
 from dnnmso_mj.recording import McapRecorder
-from dnnmso_mj.run import LoggedRun, run_to_end
+from dnnmso_mj.run import run_to_end
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.simulation import Progress, Simulation
 from dnnmso_mj.trace import Event, RunInfo, StepLayout

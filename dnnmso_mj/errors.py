@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dnnmso_mj.trace import Trace
+    from dnnmso_mj.logged import LoggedRun
 
 
 class DnnmsoError(Exception):
@@ -30,13 +29,13 @@ class ExternalError(DnnmsoError):
 
 
 class RunInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a logged run; the log is whole and holds the run's first `ticks`: `trace`."""
+    """Ctrl-C during a logged run; the log is whole and holds what was `run`."""
 
-    def __init__(self, log: Path, ticks: int, trace: Trace | None = None) -> None:
-        super().__init__(f"log: {log} ({ticks} ticks)")
-        self.log = log
-        self.ticks = ticks
-        self.trace = trace
+    def __init__(self, run: LoggedRun) -> None:
+        super().__init__(f"log: {run.log} ({run.ticks} ticks)")
+        self.run = run
+        self.log = run.log
+        self.ticks = run.ticks
 
 
 class NonFiniteError(DnnmsoError):

@@ -21,11 +21,11 @@ from dnnmso_mj.errors import LogError, ScenarioError
 from dnnmso_mj.loading.changing import MODEL, change_scenario
 from dnnmso_mj.loading.overrides import parse_overrides
 from dnnmso_mj.log.segments import Segment
+from dnnmso_mj.logged import LoggedRun
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.recomputing import state_at
 from dnnmso_mj.recorded import Recorded, read_recorded
-from dnnmso_mj.run import LoggedRun
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.simulation import Progress, Simulation
 

@@ -5,19 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from dnnmso_mj.assets import read_assets
 from dnnmso_mj.errors import LogError, RunInterrupted
 from dnnmso_mj.interrupts import interrupted_once, raise_lost
-from dnnmso_mj.metrics import compute_metrics
+from dnnmso_mj.logged import LoggedRun, judge
 from dnnmso_mj.paths import find_model, logs_dir
 from dnnmso_mj.plant import Mjcf
-from dnnmso_mj.reading import read_trace
 from dnnmso_mj.realtime import left_in_peace, real_time_pace
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.scenario import Scenario
@@ -25,20 +21,12 @@ from dnnmso_mj.scene import Scene
 from dnnmso_mj.simulation import Progress, Simulation
 from dnnmso_mj.stage import AS_FAST_AS_CAN_BE
 from dnnmso_mj.tee import Tee
-from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
+from dnnmso_mj.trace import Event, RunInfo, StepLayout
 
 if TYPE_CHECKING:
     from dnnmso_mj.viewer.live import LiveView
 
 MAX_NUMBERED = 10_000
-
-
-@dataclass(frozen=True)
-class LoggedRun:
-    """A finished run: its columns, and the log they were read back from."""
-
-    trace: Trace
-    log: Path
 
 
 def run_logged(
@@ -124,10 +112,9 @@ def run_to_end(
             end()
             wall = time.perf_counter() - started
             info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
-            trace = _finish(recorder, scenario, layout, info, live)
-            raise RunInterrupted(recorder.path, len(trace), trace) from stop
+            raise RunInterrupted(_finish(recorder, scenario, layout, info, live)) from stop
         end()
-        return LoggedRun(_finish(recorder, scenario, layout, info, live), recorder.path)
+        return _finish(recorder, scenario, layout, info, live)
 
 
 def _finish(
@@ -136,24 +123,14 @@ def _finish(
     layout: StepLayout,
     info: RunInfo,
     live: LiveView | None,
-) -> Trace:
+) -> LoggedRun:
     """Compute the metrics of what the log holds, and end log and view with them."""
     recorder.flush()
-    if recorder.ticks:
-        trace = read_trace(recorder.path)
-    else:  # ended before its first row
-        empty = np.empty((0, layout.width))
-        trace = Trace(layout.columns(empty), scenario, info)
-    written: dict[str, Any] = {
-        "versions": trace.info.versions,
-        "git_commit": trace.info.git_commit,
-    }
-    trace = replace(trace, info=replace(info, **written))
-    info = replace(trace.info, metrics=compute_metrics(trace))
-    recorder.finish(info)
+    done = judge(recorder.path, scenario, layout, info, recorder.ticks)
+    recorder.finish(done.info)
     if live is not None:
-        live.end(info)
-    return replace(trace, info=info)
+        live.end(done.info)
+    return done
 
 
 def _open_log(
