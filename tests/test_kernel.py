@@ -63,10 +63,10 @@ def printed_madam(
 @EACH_PRECISION
 @pytest.mark.parametrize("eta_max", [0.02, 0.1, 0.11, 0.9])
 def test_three_updates_are_madam_as_printed(shape, precision, eta_max):
-    """The gradients vary enough for ratios on both sides of the clamp."""
+    """The first ratio, 1/√(1−β), is beyond the clamp, as long as it is not corrected."""
     for corrected in (False, True):
         spec = Madam(
-            eta=0.01, eta_max=eta_max, sigma_max=0.5, beta=0.9, bias_correction=corrected
+            eta=eta_max / 2, eta_max=eta_max, sigma_max=0.5, beta=0.9, bias_correction=corrected
         )
         w, _, _ = sample(shape)
         w = w.astype(precision)
@@ -136,6 +136,7 @@ def test_weights_come_back_as_they_were_given_in_their_precision(shape, precisio
     net = build_net(shape, w, rule)
     for array in (net.w, net.v, net.m, net.g, net.acts, net.deltas):
         assert array.dtype == w.dtype
+    assert (net.updates.dtype, net.layers.dtype, net.settings.dtype) == (int, int, float)
     assert net.m.size == net.g.size == (0 if isinstance(rule, Madam) else net.w.size)
     assert np.array_equal(unpack(shape, net.w), w)
     assert pack(shape, w).dtype == w.dtype

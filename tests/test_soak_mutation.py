@@ -84,10 +84,11 @@ def test_every_explanation_is_of_a_mutant_there_is_and_gives_a_reason() -> None:
 
 def test_an_explanation_without_a_reason_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "explained.txt"
-    path.write_text("# note\nkernel.py learn\n- a\n+ b\nSame.\n\nkernel.py\n- c\n+ d\n- e\n+ f\nWhy\nnot.\n")
+    path.write_text("# note\nkernel.py learn\n- a\n+ b\nSame.\n\nkernel.py\n- c\n+ d\n+ e\n- e\n+ f\nWhy\nnot.\n")
     assert explanations(path) == {
         ("kernel.py", "learn", "a", "b"): "Same.",
         ("kernel.py", "", "c", "d"): "Why not.",
+        ("kernel.py", "", "c", "e"): "Why not.",
         ("kernel.py", "", "e", "f"): "Why not.",
     }
     path.write_text("kernel.py learn\n- a\n+ b\n")

@@ -52,6 +52,10 @@ MEMORY_BYTES = 2**30  # that a mutant may take beside what is imported
 LEAST_S, TIMES = 5.0, 10.0  # time limit: so long, and so many times what the tests take unchanged
 
 
+class UnfitError(Exception):
+    """A mutant's function cannot stand where the original does."""
+
+
 def plain(function: F) -> F:
     """In the place of the decorators that compile."""
     function.py_func = function  # type: ignore[attr-defined]
@@ -104,6 +108,8 @@ def _transplant(old: Any, new: Any) -> None:
         old, new = old.fget, new.fget
     old, new = inspect.unwrap(old), inspect.unwrap(new)
     if isinstance(new, types.FunctionType):
+        if len(old.__code__.co_freevars) != len(new.__code__.co_freevars):
+            raise UnfitError(new.__qualname__)
         old.__code__, old.__defaults__ = new.__code__, new.__defaults__
         old.__kwdefaults__ = new.__kwdefaults__
 
@@ -211,8 +217,8 @@ def _try(
     try:
         if source:
             mutate(file, source)
-    except ValueError as error:  # the code does not fit where it should stand
-        _leave(BROKEN, repr(error))
+    except UnfitError as error:
+        _leave(BROKEN, str(error))
     except BaseException as error:
         _leave(KILLED, f"import: {error!r}")
     try:
