@@ -14,7 +14,7 @@ from numba.core import event
 
 from dnnmso_mj.compile_loop import compile_elsewhere, compile_halves_elsewhere
 from dnnmso_mj.compiling import CompileNotice
-from dnnmso_mj.controllers import Controller, build_controller, compiled_ticks
+from dnnmso_mj.controllers import Controller, build_controller, compiled_ticks, no_command
 from dnnmso_mj.divergence import not_finite
 from dnnmso_mj.errors import EndedEarlyError, NonFiniteError
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK, MemoryRecorder
@@ -140,8 +140,9 @@ class Simulation:
                 state = self.controller.state()
                 self._start()
                 begin_tick(world, 0)
-                self._command = self.controller.update(world.inputs)  # also if tick 0 comes late
-                end_tick(world, self._command, 0)
+                command = self.controller.update(world.inputs)
+                end_tick(world, command, 0)
+                self._command = no_command(command)  # of a first tick that is begun too late
                 self.controller.restore(state)
 
     def _start(self) -> None:
