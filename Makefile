@@ -3,13 +3,17 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
+INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check
+LOCKED := $(INSTALL) --require-hashes --no-deps --only-binary :all:
+OURSELVES := $(INSTALL) --no-deps --no-build-isolation --editable .
+locks = $(patsubst %,requirements/%.txt,$(1))
 SCENARIO ?= scenarios/paper.yaml
 PYTEST_ARGS ?=
 
 SOAK_ARGS = $(if $(ROW),--row $(ROW)) $(if $(SEED),--seed $(SEED)) $(if $(SHORT),--short)
 
-.PHONY: help run test soak golden check format figures experiments schema docs build clean
+.PHONY: help run test soak golden check format figures experiments schema docs build lock sbom \
+  licences audit clean
 
 help:
 	@echo "make run      install, run $(SCENARIO), print where the log and the figures are"
@@ -23,6 +27,10 @@ help:
 	@echo "make schema   write scenarios/scenario.schema.json anew"
 	@echo "make docs     build the documentation site; open site/index.html"
 	@echo "make build    build wheel and sdist into dist/"
+	@echo "make lock     requirements/ anew, after a change of constraints.txt or pyproject.toml"
+	@echo "make sbom     a bill of materials of all that is installed, dist/sbom.json"
+	@echo "make licences check the licence of all that is installed"
+	@echo "make audit    ask for known vulnerabilities of all that is locked"
 	@echo "make clean    remove the environment and all caches"
 
 run: $(VENV)/.installed-run
@@ -61,7 +69,19 @@ docs: $(VENV)/.installed-docs
 	@echo "site/index.html; with its search: $(BIN)/python -m http.server --directory site --bind 127.0.0.1"
 
 build: $(VENV)/.installed-test
-	$(BIN)/python -m build --no-isolation
+	PYTHONPATH=tests $(BIN)/python -m supply.build dist
+
+lock: $(VENV)/.installed-check
+	PYTHONPATH=tests $(BIN)/python -m supply.lock
+
+sbom: $(VENV)/.installed-test
+	PYTHONPATH=tests $(BIN)/python -m supply.sbom dist/sbom.json
+
+licences: $(VENV)/.installed-test
+	PYTHONPATH=tests $(BIN)/python -m supply.licences
+
+audit: $(VENV)/.installed-test
+	PYTHONPATH=tests $(BIN)/python -m supply.audit
 
 clean:
 	rm -rf $(VENV) dist site .pytest_cache .mypy_cache .ruff_cache .hypothesis
@@ -72,18 +92,23 @@ $(VENV)/bin/pip:
 	  { echo "dnnmso_mj needs Python 3.11 or newer; try: make PYTHON=python3.12" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.installed-run: pyproject.toml constraints.txt | $(VENV)/bin/pip
-	$(PIP) --editable ".[standard]"
+$(VENV)/.installed-run: pyproject.toml $(call locks,run) | $(VENV)/bin/pip
+	$(LOCKED) $(patsubst %,--requirement %,$(call locks,run))
+	$(OURSELVES)
 	@touch $@
 
-$(VENV)/.installed-docs: pyproject.toml constraints.txt | $(VENV)/bin/pip
-	$(PIP) --editable ".[docs]"
-	@touch $@
+$(VENV)/.installed-docs: pyproject.toml $(call locks,run docs) | $(VENV)/bin/pip
+	$(LOCKED) $(patsubst %,--requirement %,$(call locks,run docs))
+	$(OURSELVES)
+	@touch $@ $(VENV)/.installed-run
 
-$(VENV)/.installed-test: pyproject.toml constraints.txt | $(VENV)/bin/pip
-	$(PIP) --editable ".[test]"
+# torch alone is not locked: a machine may serve a build of its own, in constraints.txt's version.
+$(VENV)/.installed-test: pyproject.toml constraints.txt $(call locks,run docs test) | $(VENV)/bin/pip
+	$(LOCKED) $(patsubst %,--requirement %,$(call locks,run docs test))
+	$(INSTALL) --constraint constraints.txt torch
+	$(OURSELVES)
 	@touch $@ $(VENV)/.installed-run $(VENV)/.installed-docs
 
-$(VENV)/.installed-check: pyproject.toml constraints.txt | $(VENV)/bin/pip
-	$(PIP) --editable ".[check]"
-	@touch $@ $(VENV)/.installed-run $(VENV)/.installed-docs $(VENV)/.installed-test
+$(VENV)/.installed-check: $(call locks,check) | $(VENV)/.installed-test
+	$(LOCKED) $(patsubst %,--requirement %,$(call locks,check))
+	@touch $@

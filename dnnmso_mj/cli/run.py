@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dnnmso_mj.cli.live import Port, Serve, View, live_view
+from dnnmso_mj.cli.live import LOCAL, Bind, Port, Serve, View, live_view
 from dnnmso_mj.cli.shared import (
     DIVERGED,
     Json,
@@ -59,6 +59,7 @@ def run(
     view: View = False,
     serve: Serve = False,
     port: Port = 9090,
+    bind: Bind = LOCAL,
     plot: Annotated[bool, typer.Option(help="Draw the figures beside the log.")] = True,
     trust: Trust = False,
     as_json: Json = False,
@@ -70,7 +71,7 @@ def run(
     plot = plot and can_draw()
     sets = [*(overrides or []), *([] if seed is None else [f"seed={seed}"])]
     loaded = load_scenario(scenario, sets, trust=trust)
-    with live_view(view, serve, port) as live:
+    with live_view(view, serve, port, bind) as live:
         try:
             with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
                 done = run_logged(

@@ -7,33 +7,26 @@ from pathlib import Path
 
 import numpy as np
 
-from dnnmso_mj.log.messages import Messages
 from dnnmso_mj.log.scan import Scan, scan
-from dnnmso_mj.log.step_message import StepFormat, layout_of
+from dnnmso_mj.trace import StepLayout
 
 Array = np.ndarray
 Columns = dict[str, Array]
 
 
 class _Blocks:
-    """Collects messages on /step until they fill a block."""
+    """Collects rows until they fill a block."""
 
     def __init__(self, take: Callable[[Columns], None], ticks: int) -> None:
         self._take, self._ticks = take, ticks
-        self._format: StepFormat | None = None
-        self._filled = self._count = 0
+        self._layout: StepLayout | None = None
+        self._filled = 0
 
-    def add(self, messages: Messages) -> None:
-        """Take the next messages.
-
-        Raises:
-            ValueError: one is no `dnnmso.Step`, or unlike the first.
-        """
-        if self._format is None:
-            self._format = StepFormat(layout_of(messages.data[0].tobytes()))
-            self._rows = np.empty((self._ticks, self._format.layout.width))
-        rows = self._format.decode(messages.data, self._count)
-        self._count += len(rows)
+    def add(self, layout: StepLayout, rows: Array) -> None:
+        """Take the next rows."""
+        if self._layout is None:
+            self._layout = layout
+            self._rows = np.empty((self._ticks, layout.width))
         while len(rows):
             part = rows[: self._ticks - self._filled]
             self._rows[self._filled : self._filled + len(part)] = part
@@ -44,8 +37,8 @@ class _Blocks:
 
     def end(self) -> None:
         """Give what has come since the last block."""
-        if self._format is not None and self._filled:
-            self._take(self._format.layout.columns(self._rows[: self._filled]))
+        if self._layout is not None and self._filled:
+            self._take(self._layout.columns(self._rows[: self._filled]))
             self._filled = 0
 
 
