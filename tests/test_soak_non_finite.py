@@ -48,7 +48,7 @@ def test_an_infinite_weight_ends_the_run_though_its_neuron_only_saturates(
     struck: Struck, clean: Trace
 ) -> None:
     check(struck, clean)
-    assert "weights not finite" in struck.run.trace.info.reason
+    assert "weights" in struck.run.trace.info.reason
     assert np.isinf(struck.kept["weights"]).sum() == 1  # it has not been learned away
 
 
@@ -58,7 +58,7 @@ def test_an_infinite_moment_that_stops_learning_is_found(
     fault = Fault("optimiser", TICK, np.inf, 0.3)
     struck = run_struck(*job, fault, tmp_path / "run.mcap")
     check(struck, clean)
-    assert struck.run.trace.info.reason.startswith("second_moment = inf at entry ")
+    assert "second_moment" in struck.run.trace.info.reason
 
 
 def test_the_checker_misses_nothing(struck: Struck, clean: Trace) -> None:
