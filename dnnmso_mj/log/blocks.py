@@ -18,15 +18,13 @@ class _Blocks:
     """Collects rows until they fill a block."""
 
     def __init__(self, take: Callable[[Columns], None], ticks: int) -> None:
-        self._take, self._ticks = take, ticks
+        self._take, self._ticks, self._filled = take, ticks, 0
         self._layout: StepLayout | None = None
-        self._filled = 0
 
     def add(self, layout: StepLayout, rows: Array) -> None:
         """Take the next rows."""
         if self._layout is None:
-            self._layout = layout
-            self._rows = np.empty((self._ticks, layout.width))
+            self._layout, self._rows = layout, np.empty((self._ticks, layout.width))
         while len(rows):
             part = rows[: self._ticks - self._filled]
             self._rows[self._filled : self._filled + len(part)] = part
