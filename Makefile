@@ -69,7 +69,7 @@ docs: $(VENV)/.installed-docs
 	@echo "site/index.html; with its search: $(BIN)/python -m http.server --directory site --bind 127.0.0.1"
 
 build: $(VENV)/.installed-test
-	PYTHONPATH=tests $(BIN)/python -m supply.build dist
+	$(BIN)/python -m build --no-isolation
 
 lock: $(VENV)/.installed-check
 	PYTHONPATH=tests $(BIN)/python -m supply.lock

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from dnnmso_mj.files import whole_file
 from dnnmso_mj.sweep.plan import Plan, SweepError
 
 METADATA_KEY = b"dnnmso_sweep"
@@ -85,23 +85,26 @@ def finished_table(rows: pa.Table, plan: Plan, provenance: dict[str, Any]) -> pa
     return pa.table(columns, schema=pa.schema(fields, metadata={METADATA_KEY: text}))
 
 
-def write_table(table: pa.Table, out: Path) -> None:
+def write_table(table: pa.Table, out: Path, *, replace: bool = True) -> None:
     """Write Parquet: whole under its name, or not at all.
 
+    Args:
+        table: what is written.
+        out: the file.
+        replace: whether it may take the place of another one.
+
     Raises:
-        SweepError: the file cannot be written.
+        SweepError: the file cannot be written, or is there and may not be replaced.
     """
-    unfinished = out.with_name(f".{out.name}.tmp")
     try:
-        with unfinished.open("wb") as stream:
-            pq.write_table(table, stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        unfinished.replace(out)
-    except BaseException as error:
-        unfinished.unlink(missing_ok=True)
-        if not isinstance(error, OSError):
-            raise
+        with whole_file(out, replace=replace, sync=True) as file:
+            pq.write_table(table, file)
+    except FileExistsError as error:
+        raise SweepError(
+            f"{out}: has been made by something else meanwhile, and nothing is written over it; "
+            f"the rows are kept beside it; allowed: move it away, then --resume"
+        ) from error
+    except OSError as error:
         raise SweepError(f"{out}: cannot be written: {error.strerror or error}") from error
 
 
