@@ -50,6 +50,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         "test_network.py::test_first",
         "test_network.py::test_second",
         "test_network.py::test_a_gradient",
+        "test_network.py::test_reference",
     ),
     "observer.py": ("test_observer.py", "test_control.py::test_observer",),
     "inversion.py": (

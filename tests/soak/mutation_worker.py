@@ -95,7 +95,7 @@ def mutate(file: str, source: str) -> None:
                 _transplant(vars(old).get(attribute), member)
         elif getattr(value, "__module__", None) == name and callable(value):
             _transplant(old, value)
-        elif not isinstance(value, types.ModuleType) and not callable(value) and value != old:
+        elif not isinstance(value, types.ModuleType) and value is not old and value != old:
             vars(module)[key] = value
             for other in list(sys.modules.values()):
                 if not isinstance(old, type) and vars(other).get(key, module) is old:
