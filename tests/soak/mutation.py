@@ -61,8 +61,8 @@ TESTS: dict[str, tuple[str, ...]] = {
         "test_control.py::test_torque",
         "test_control.py::test_closed_form",
     ),
-    "recording.py": ("test_recording.py",),
-    "log/content.py": ("test_recording.py",),
+    "recording.py": ("test_recorder.py", "test_recording.py"),
+    "log/content.py": ("test_recorder.py", "test_recording.py"),
     "log/writer.py": ("test_log_writer.py",),
 }
 
