@@ -65,7 +65,9 @@ def plain(function: F) -> F:
 def interpret() -> None:
     """Let everything that is compiled run in the interpreter; before any of it is imported."""
     compiling.compiled = compiling.inner = plain
-    compiling.copy = plain(compiling.copy.py_func)  # type: ignore[attr-defined]
+    for name, value in list(vars(compiling).items()):
+        if hasattr(value, "py_func"):
+            setattr(compiling, name, plain(value.py_func))
     from numba.core.types import ExternalFunction
 
     from dnnmso_mj import mujoco_calls
