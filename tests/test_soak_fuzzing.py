@@ -20,9 +20,10 @@ def test_fuzzed_input_gives_typed_errors_only(tmp_path):
 
 def test_a_broken_target_is_lost_in_each_way_that_it_is_broken(tmp_path):
     """A KeyError, a second too long, 300 MB too much, and the end of the process."""
-    found = fuzz(Job("planted", 50, 3000), tmp_path, {"PLANTED": "die"})
-    inputs = {base64.b64decode(failure.input) for failure in found.failures.values()}
-    assert inputs >= {b"key", b"slow", b"big", b"die"}, found.failures
+    found = fuzz(Job("planted", 50, 1000), tmp_path)
+    inputs = [base64.b64decode(failure.input) for failure in found.failures.values()]
+    for word in (b"key", b"slow", b"big", b"die"):
+        assert any(word in data for data in inputs), (word, found.failures)
     tally = Tally()
     count("planted", [found], tally)
     assert not tally.passed

@@ -153,6 +153,9 @@ def _rename(here: ElementTree.Element, rng: random.Random) -> None:
     here.tag = rng.choice(TAGS)
 
 
+CHANGES = (_set, _set, _change, _change, _drop, _add, _cut, _copy, _copy, _rename)
+
+
 def target(work: Path) -> Any:
     plants = (Plant(masses=None, lengths=None), Plant())
     file = work / "model.xml"

@@ -23,7 +23,7 @@ from soak.proof import TESTS
 from soak.tally import Form, Tally
 
 AT_ONCE = 2
-STALLED_S = 60.0
+STALLED_S, START_S = 60.0, 300.0  # with one case, and before the first
 DEATHS = 5  # of a process of one job, before it is given up
 TOLD = 20  # cases of one way to fail that are listed
 
@@ -151,8 +151,8 @@ def _watch(process: subprocess.Popen[bytes], note: Path) -> str:
             now = tried_now(note)[0] if note.exists() and note.stat().st_size else 0
             if now != cases:
                 cases, since = now, time.monotonic()
-            elif time.monotonic() - since > STALLED_S:
-                return f"hung for {STALLED_S:g} s"
+            elif time.monotonic() - since > (STALLED_S if cases else START_S):
+                return f"hung for {time.monotonic() - since:.0f} s"
         else:
             return f"the process ended with status {status}" if status else ""
 
