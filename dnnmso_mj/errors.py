@@ -38,7 +38,23 @@ class RunInterrupted(KeyboardInterrupt):
         self.ticks = run.ticks
 
 
-class NonFiniteError(DnnmsoError):
+class UnloggedRunError(LogError):
+    """A run that ended because its log could not be written; `run` holds what the log does."""
+
+    def __init__(self, why: str, run: LoggedRun) -> None:
+        super().__init__(why)
+        self.run = run
+
+
+class EndedEarlyError(DnnmsoError):
+    """What ends a run before its time; the run says so in its status, and its log is whole."""
+
+
+class SafeStopError(EndedEarlyError):
+    """A joint that was past a limit of the scenario: the arm was stopped."""
+
+
+class NonFiniteError(EndedEarlyError):
     """A quantity that left the finite range, or grew past every plausible value, during a run."""
 
     def __init__(self, quantity: str, value: object) -> None:

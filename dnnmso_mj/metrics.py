@@ -25,6 +25,16 @@ SETTLING_DWELL = 0.1  # of the run: an error that merely crosses zero at the end
 BOUND_MARGIN = 1.01  # the bound is of continuous time, the loop is sampled
 BOUND_ROUNDING = 1e-9  # rad
 
+# What a run must have come to its end for.
+WHOLE = (
+    "rmse",
+    "rmse_steady",
+    "max_abs_error_steady",
+    "tau_chatter",
+    "f_err_rms_steady",
+    "settling_time",
+)
+
 
 def compute_metrics(trace: Trace) -> Metrics:
     """All metrics of a run; the names are a contract with `--json`, sweeps and logs.
@@ -42,11 +52,14 @@ def compute_metrics(trace: Trace) -> Metrics:
             half (rad/s and rad/s²).
         settling_time: see `settling_time` (s).
         bound_violations: see `bound_violations` (ticks).
-        diverged: whether the run was stopped because it left the plausible range.
+        diverged: whether the run was stopped because it left the plausible range, or a limit of
+            its joints.
         compute_us_p50, compute_us_p999: percentiles 50 and 99.9 of the controller's time (µs).
         deadline_misses: ticks without a command in time, whatever the cause; see `timing`.
 
-        None stands for what is not defined: too few ticks, or a column that is not finite.
+        None stands for what is not defined: too few ticks, or a column that is not finite; and for
+        every mean, steady value and settling of a run that diverged, in `WHOLE`, since the part
+        that was run is no smaller run. Largest values and counts are of the ticks that there are.
     """
     return block_metrics(_blocks_of(trace), len(trace), trace.info.status)
 
@@ -72,20 +85,21 @@ def block_metrics(each: Each, n_ticks: int, status: str) -> Metrics:
     sums = _Sums(n_ticks, extremes)
     each(sums.take)
     p50, p999 = _percentiles(extremes.compute_us)
-    return {
+    found: Metrics = {
         "rmse": sums.error.root_mean_square(),
         "rmse_steady": sums.error_steady.root_mean_square(),
         "max_abs_error_steady": extremes.error_steady.value(),
         "tau_peak": extremes.tau.value(),
         "tau_chatter": sums.chatter.mean(),
         "f_err_rms_steady": sums.f_err.root_mean_square(),
-        "settling_time": None if status == "diverged" else sums.settling_time(),
+        "settling_time": sums.settling_time(),
         "bound_violations": extremes.violations if extremes.bounded else None,
         "diverged": status == "diverged",
         "compute_us_p50": p50,
         "compute_us_p999": p999,
         "deadline_misses": extremes.misses,
     }
+    return found | dict.fromkeys(WHOLE if found["diverged"] else ())
 
 
 def settling_time(trace: Trace) -> float | None:

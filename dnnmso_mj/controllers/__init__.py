@@ -93,6 +93,12 @@ class Command(NamedTuple):
     monitors: Monitors  # of the network's update; empty without a network
 
 
+def no_command(like: Command) -> Command:
+    """What stands in the log until a controller's first command: zeros, as many as it will have."""
+    monitors = Monitors(*map(np.zeros_like, like.monitors))
+    return Command(*map(np.zeros_like, like[:-1]), monitors)
+
+
 def command_of(inversion: DynamicInversion, e_obs: Array, monitors: Monitors) -> Command:
     """A command that shows what these parts hold, with its own x_hat and f_hat."""
     x_hat, f_hat = np.zeros((2, e_obs.size))
