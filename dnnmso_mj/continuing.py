@@ -15,12 +15,13 @@ from dnnmso_mj.assets import named_files
 from dnnmso_mj.errors import LogError
 from dnnmso_mj.log.format import MODEL
 from dnnmso_mj.log.segments import RESUMED, SEGMENTS, Segment, segments_record
+from dnnmso_mj.logged import LoggedRun
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.recorded import Recorded
 from dnnmso_mj.recorder import Recorder
 from dnnmso_mj.recording import McapRecorder
-from dnnmso_mj.run import MAX_NUMBERED, LoggedRun, open_first_free, run_to_end
+from dnnmso_mj.run import MAX_NUMBERED, open_first_free, run_to_end
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.simulation import Progress, Simulation
 from dnnmso_mj.trace import Event, RunInfo, StepLayout
@@ -109,12 +110,12 @@ class Continuation:
         segments, files = [], dict(self.model.files)
         for part in self.source.segments:
             if part.first < self.last.first:
-                text = self.source.files[part.model]
-                own = text == self.model.text.encode()
+                text = self.source.model(part.model)
+                own = text == self.model.text
                 name = MODEL if own else f"model-{part.first}.xml"
                 segments.append(replace(part, model=name))
                 if not own:
-                    files |= {name: text, **named_files(text.decode(), self.source.files)}
+                    files |= {name: text.encode(), **named_files(text, self.source.files)}
         return [*segments, replace(self.last, model=MODEL)] if segments else [], files
 
 

@@ -20,11 +20,12 @@ from dnnmso_mj.errors import LogError, ScenarioError
 from dnnmso_mj.loading.changing import MODEL, change_scenario
 from dnnmso_mj.loading.overrides import parse_overrides
 from dnnmso_mj.log.segments import Segment
+from dnnmso_mj.logged import LoggedRun
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.recomputing import state_at
 from dnnmso_mj.recorded import Recorded, read_recorded
-from dnnmso_mj.run import MAX_NUMBERED, LoggedRun
+from dnnmso_mj.run import MAX_NUMBERED
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.simulation import Progress, Simulation
 
@@ -129,10 +130,7 @@ def _tick(source: Recorded, at: float) -> int:
 
 def _model(source: Recorded, segment: Segment, folder: Path) -> Model:
     """The model of a segment, from the log alone; its meshes go to a folder."""
-    data = source.files.get(segment.model)
-    if data is None:
-        raise LogError(f"{source.path}: has no attachment {segment.model}; it cannot be resumed")
-    text = data.decode()
+    text = source.model(segment.model)
     files = named_files(text, source.files)
     return Model(put_back(text, files, folder), text, files)
 

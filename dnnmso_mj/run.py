@@ -6,19 +6,17 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from dnnmso_mj.assets import read_assets
 from dnnmso_mj.errors import LogError, RunInterrupted, UnloggedRunError
 from dnnmso_mj.interrupts import interrupted_once, raise_lost
-from dnnmso_mj.metrics import compute_metrics
+from dnnmso_mj.logged import LoggedRun, judge
 from dnnmso_mj.paths import find_model, logs_dir
 from dnnmso_mj.plant import Mjcf
-from dnnmso_mj.reading import read_trace
+from dnnmso_mj.reading import log_info
 from dnnmso_mj.realtime import left_in_peace, real_time_pace
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.scenario import Scenario
@@ -26,20 +24,12 @@ from dnnmso_mj.scene import Scene
 from dnnmso_mj.simulation import Progress, Simulation
 from dnnmso_mj.stage import AS_FAST_AS_CAN_BE
 from dnnmso_mj.tee import Tee
-from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
+from dnnmso_mj.trace import Event, RunInfo, StepLayout
 
 if TYPE_CHECKING:
     from dnnmso_mj.viewer.live import LiveView
 
 MAX_NUMBERED = 10_000
-
-
-@dataclass(frozen=True)
-class LoggedRun:
-    """A finished run: its columns, and the log they were read back from."""
-
-    trace: Trace
-    log: Path
 
 
 def run_logged(
@@ -127,18 +117,17 @@ def run_to_end(
             end()
             wall = time.perf_counter() - started
             info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
-            trace = _finish(recorder, scenario, layout, info, live)
-            raise RunInterrupted(recorder.path, len(trace), trace) from stop
+            raise RunInterrupted(_finish(recorder, scenario, layout, info, live)) from stop
         except LogError as error:
             if not recorder.broken:
                 raise
             end()
             wall = time.perf_counter() - started
             info = RunInfo("failed", scenario.seed, wall, reason=str(error))
-            trace = _measured(_read(recorder, scenario, layout, info), info)
-            raise UnloggedRunError(str(error), recorder.path, trace) from error
+            run_so_far = judge(recorder.path, scenario, layout, info, *_readable(recorder))
+            raise UnloggedRunError(str(error), run_so_far) from error
         end()
-        return LoggedRun(_finish(recorder, scenario, layout, info, live), recorder.path)
+        return _finish(recorder, scenario, layout, info, live)
 
 
 def _finish(
@@ -147,43 +136,31 @@ def _finish(
     layout: StepLayout,
     info: RunInfo,
     live: LiveView | None,
-) -> Trace:
+) -> LoggedRun:
     """Compute the metrics of what the log holds, and end log and view with them."""
+    done: LoggedRun | None = None
     try:
         recorder.flush()
-    except LogError as error:
-        why = replace(info, status="failed", reason=str(error))
-        trace = _measured(_read(recorder, scenario, layout, why), why)
-        raise UnloggedRunError(str(error), recorder.path, trace) from error
-    trace = _measured(_read(recorder, scenario, layout, info), info)
-    try:
-        recorder.finish(trace.info)
+        done = judge(recorder.path, scenario, layout, info, recorder.ticks, recorder.readable)
+        recorder.finish(done.info)
     except LogError as error:
         if not recorder.broken:
             raise
-        why = replace(trace.info, status="failed", reason=str(error))
-        raise UnloggedRunError(str(error), recorder.path, replace(trace, info=why)) from error
+        if done is None:
+            done = judge(recorder.path, scenario, layout, info, *_readable(recorder))
+        failed = replace(done.info, status="failed", reason=str(error))
+        raise UnloggedRunError(str(error), replace(done, info=failed)) from error
     if live is not None:
-        live.end(trace.info)
-    return trace
+        live.end(done.info)
+    return done
 
 
-def _read(recorder: McapRecorder, scenario: Scenario, layout: StepLayout, info: RunInfo) -> Trace:
-    """What the log holds; nothing, where it cannot be read."""
+def _readable(recorder: McapRecorder) -> tuple[int, Path]:
+    """How many ticks of a log that could not be written can be read, and where."""
     try:
-        if recorder.ticks:  # else it ended before its first row
-            return read_trace(recorder.readable)
+        return log_info(recorder.readable).ticks, recorder.readable
     except LogError:
-        if not recorder.broken:
-            raise
-    return Trace(layout.columns(np.empty((0, layout.width))), scenario, info)
-
-
-def _measured(trace: Trace, info: RunInfo) -> Trace:
-    """A run with its metrics, and how it ended."""
-    info = replace(info, versions=trace.info.versions, git_commit=trace.info.git_commit)
-    trace = replace(trace, info=info)
-    return replace(trace, info=replace(info, metrics=compute_metrics(trace)))
+        return 0, recorder.path
 
 
 def open_first_free(

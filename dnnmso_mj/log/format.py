@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,12 +19,15 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from dnnmso_mj.errors import LogError
 from dnnmso_mj.log import step_message
+from dnnmso_mj.log.json_texts import read_json
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.trace import Event, RunInfo
+from dnnmso_mj.wording import show
 
 Array = np.ndarray
 
 NS_PER_S = 1_000_000_000
+LONGEST = 1e9  # s; what is of a later time was no run's
 MODEL = "model.xml"  # the attachment that holds the MJCF
 _SNAPSHOT, _NPZ = "snapshot/", ".npz"
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
@@ -101,6 +105,8 @@ def event_of(data: bytes) -> Event:
     except DecodeError as error:
         raise ValueError(f"a message is no {EVENTS.schema_name}") from error
     t = (message.timestamp.seconds * NS_PER_S + message.timestamp.nanos) / NS_PER_S
+    if not 0.0 <= t <= LONGEST:
+        raise ValueError(f"an event of {t:g} s; expected 0 to {LONGEST:g}")
     return Event(t, _LEVEL_NAMES.get(message.level, "info"), message.message)
 
 
@@ -145,15 +151,27 @@ def run_info(records: Mapping[str, Mapping[str, str]]) -> RunInfo:
         ValueError: a value is not of its type.
     """
     run = {"status": "unfinished", **records.get("scenario", {}), **records.get("run", {})}
+    wall_s, seed = float(run.get("wall_s", "0")), int(run.get("seed", "0"))
+    if not math.isfinite(wall_s) or abs(seed) >= 1 << 64:
+        raise ValueError(f"seed = {show(run['seed'])}, wall_s = {wall_s}")
+    metrics = {name: _metric(name, text) for name, text in records.get("metrics", {}).items()}
     return RunInfo(
         status=run["status"],
-        seed=int(run.get("seed", "0")),
-        wall_s=float(run.get("wall_s", "0")),
+        seed=seed,
+        wall_s=wall_s,
         reason=run.get("reason", ""),
         versions=dict(records.get("versions", {})),
         git_commit=records.get("git", {}).get("commit", ""),
-        metrics={name: json.loads(value) for name, value in records.get("metrics", {}).items()},
+        metrics=metrics,
     )
+
+
+def _metric(name: str, text: str) -> float | int | bool | None:
+    value = read_json(text)
+    whole = isinstance(value, int) and abs(value) < 1 << 64  # bool too
+    if not (value is None or whole or (isinstance(value, float) and math.isfinite(value))):
+        raise ValueError(f"metric {show(name)} = {show(value)}")
+    return value  # type: ignore[no-any-return]
 
 
 def snapshot_name(name: str, t: float) -> str:
@@ -167,6 +185,8 @@ def snapshot_place(attachment: str) -> tuple[str, float] | None:
     try:
         place = name, float(t)
     except ValueError:
+        return None
+    if not 0.0 <= place[1] <= LONGEST:
         return None
     return place if attachment == snapshot_name(*place) else None
 
@@ -193,16 +213,3 @@ def snapshot_data(arrays: Mapping[str, Array]) -> bytes:
             with archive.open(f"{key}.npy", "w") as file:
                 np.lib.format.write_array(file, array, allow_pickle=False)
     return data.getvalue()
-
-
-def snapshot_arrays(data: bytes) -> dict[str, Array]:
-    """Arrays from NumPy's npz, without pickle.
-
-    Raises:
-        ValueError: the bytes are no such file.
-    """
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except Exception as error:  # of many kinds: whatever damaged bytes provoke
-        raise ValueError("no npz file of plain arrays") from error
