@@ -87,8 +87,8 @@ def test_a_run_whose_log_is_taken_away_has_its_metrics_still(tmp_path):
 
     with pytest.raises(UnloggedRunError, match="was moved or removed") as failed:
         run_logged(scenario, out, progress=remove)
-    trace = failed.value.trace
-    assert (trace.info.status, len(trace)) == ("failed", scenario.n_ticks)
+    run = failed.value.run
+    assert (run.info.status, run.ticks) == ("failed", scenario.n_ticks)
     whole = run_logged(scenario, tmp_path / "whole.mcap")
-    assert trace.info.metrics["rmse"] == whole.trace.info.metrics["rmse"]
+    assert run.info.metrics["rmse"] == whole.info.metrics["rmse"]
     assert read_trace(whole.log).info.status == "ok"
