@@ -22,6 +22,7 @@ from soak.ended import dnnmso
 from soak.log_damage import Case
 from soak.tally import Form, Tally
 
+READER = "soak.log_worker"
 TICKS = 400
 MEMORY, FACTOR = 64e6, 10  # bytes, and bytes a byte of the file
 SECONDS, TIMES = 2.0, 10  # of a reader, and times what it takes for the good log
@@ -32,13 +33,14 @@ class Worker:
 
     Args:
         original: the good log.
-        program: what runs; the negative controls run one that is broken.
+        broken: how the reader is spoiled, in a negative control; see `soak.log_broken`.
     """
 
-    def __init__(self, original: Path, program: str = "soak.log_worker") -> None:
+    def __init__(self, original: Path, broken: str | None = None) -> None:
+        words = ["soak.log_broken", str(original), broken] if broken else [READER, str(original)]
         path = os.pathsep.join([str(Path(__file__).parents[1]), *filter(None, sys.path)])
         self.process = subprocess.Popen(
-            [sys.executable, "-m", program, str(original)],
+            [sys.executable, "-m", *words],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=os.environ | {"PYTHONPATH": path},
@@ -72,13 +74,13 @@ class Readers:
     Args:
         original: the good log.
         tally: of what became of the others.
-        program: see `Worker`.
+        broken: see `Worker`.
     """
 
-    def __init__(self, original: Path, tally: Tally, program: str = "soak.log_worker") -> None:
+    def __init__(self, original: Path, tally: Tally, broken: str | None = None) -> None:
         self._tally = tally
         self._free: SimpleQueue[Worker] = SimpleQueue()
-        self._all = [Worker(original, program) for _ in range(2)]
+        self._all = [Worker(original, broken) for _ in range(2)]
         for worker in self._all:
             self._free.put(worker)
         good = [worker.read(original, "whole") for worker in self._all]
@@ -269,8 +271,9 @@ def commands(form: Form, tally: Tally, original: Path, folder: Path) -> None:
             ("recover", torn), ("recover", none), ("diff", torn, original), ("diff", none, torn),
             ("plot", none), ("plot", torn), ("resume", none, "--at", "0.1"),
             ("resume", torn, "--at", "0.1"), ("replay", none, "--save", folder / "a.rrd"),
-            ("replay", torn, "--save", folder / "b.rrd"), ("report", none, "--out", folder / "b.html"),
-            ("report", torn, "--out", folder / "c.html"), ("info", fifo), ("recover", fifo),
+            ("replay", torn, "--save", folder / "b.rrd"),
+            ("report", none, "--out", folder / "b.html"), ("report", torn, "--out", folder / "c.html"),
+            ("info", fifo), ("recover", fifo),
         ]  # fmt: skip
     for line in words:
         ended = dnnmso(*line, seconds=120.0, cwd=folder)
