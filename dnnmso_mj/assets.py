@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
+from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.mjcf import Tag, named, parse
 from dnnmso_mj.plant import Mjcf
+from dnnmso_mj.wording import show
 
 PREFIX = "asset/"  # of their attachments' names
 
@@ -36,15 +38,17 @@ def put_back(text: str, files: Mapping[str, bytes], folder: Path) -> Mjcf:
         files: attachments, by name.
         folder: where to write those that the model names; it must live as long as the model is
             built from.
+
+    Raises:
+        ScenarioError: a file cannot be written, or `dnnmso_mj.mjcf.gate` refuses the model.
     """
     root = _root(text)
-    for number, (element, key, path) in enumerate(list(named(root))):
+    numbers: dict[str, int] = {}  # a file is written once, however often it is named
+    for element, key, path in list(named(root)):
         data = files.get(PREFIX + path)
-        if data is not None:
-            name = f"{number}/{Path(path).name}"  # which may name the element
-            file = folder / name
-            file.parent.mkdir(exist_ok=True)
-            file.write_bytes(data)
+        name = f"{numbers.setdefault(path, len(numbers))}/{Path(path).name}"  # of the element, too
+        if data is not None and Path(name).name != "..":
+            _write(folder / name, data)
             element.set(key, name)
     if not any(folder.iterdir()):
         return Mjcf(text)
@@ -52,6 +56,15 @@ def put_back(text: str, files: Mapping[str, bytes], folder: Path) -> Mjcf:
         for key in ("assetdir", "meshdir", "texturedir", "strippath"):
             compiler.attrib.pop(key, None)
     return Mjcf(ElementTree.tostring(root, encoding="unicode"), str(folder.resolve()))
+
+
+def _write(file: Path, data: bytes) -> None:
+    try:
+        file.parent.mkdir(exist_ok=True)
+        if not file.exists():
+            file.write_bytes(data)
+    except (OSError, ValueError) as error:
+        raise ScenarioError(f"plant.model: its file {show(file.name)}: {error}") from error
 
 
 def _root(text: str) -> Tag:

@@ -125,7 +125,7 @@ def test_lines_in_messages_of_mujoco_are_those_of_the_file() -> None:
         (world('<geom size="1e999"/>'), "out of range; allowed: -1e"),
         (world(f'<geom size="1{"0" * 300}"/>'), "out of range"),
         *(
-            (world(before=f'<option timestep="{value}"/>'), r"timestep = .*allowed: (1e-06 to 1|finite)")
+            (world(before=f'<option timestep="{value}"/>'), r"timestep = .*allowed: (1e-06|finite)")
             for value in ("0", "-1", "nan", "inf", "1e9", "", "x")
         ),
         (world(before='<option iterations="2000000000"/>'), "iterations = .*allowed: 0 to 10000"),
