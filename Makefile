@@ -3,18 +3,23 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
+INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check
+LOCKED := $(INSTALL) --require-hashes --no-deps --only-binary :all:
+OURSELVES := $(INSTALL) --no-deps --no-build-isolation --editable .
+locks = $(patsubst %,requirements/%.txt,$(1))
 SCENARIO ?= scenarios/paper.yaml
 PYTEST_ARGS ?=
 
 SOAK_ARGS = $(if $(ROW),--row $(ROW)) $(if $(SEED),--seed $(SEED)) $(if $(SHORT),--short)
 
-.PHONY: help run test soak check format figures experiments schema docs build clean
+.PHONY: help run test soak golden check format figures experiments schema docs build lock sbom \
+  licences audit clean
 
 help:
 	@echo "make run      install, run $(SCENARIO), print where the log and the figures are"
 	@echo "make test     install what the tests need and run them all"
 	@echo "make soak     prove what docs/reliability.md says, in under two hours; ROW=5 one row of it"
+	@echo "make golden   write this machine's golden hashes into tests/golden.json"
 	@echo "make check    format, lint and type checks"
 	@echo "make format   format and fix what can be fixed"
 	@echo "make figures  draw the pictures of the README and docs anew"
@@ -22,6 +27,10 @@ help:
 	@echo "make schema   write scenarios/scenario.schema.json anew"
 	@echo "make docs     build the documentation site; open site/index.html"
 	@echo "make build    build wheel and sdist into dist/"
+	@echo "make lock     requirements/ anew, after a change of constraints.txt or pyproject.toml"
+	@echo "make sbom     a bill of materials of all that is installed, dist/sbom.json"
+	@echo "make licences check the licence of all that is installed"
+	@echo "make audit    ask for known vulnerabilities of all that is locked"
 	@echo "make clean    remove the environment and all caches"
 
 run: $(VENV)/.installed-run
@@ -32,6 +41,9 @@ test: $(VENV)/.installed-test
 
 soak: $(VENV)/.installed-test
 	PYTHONPATH=tests $(BIN)/python -m soak $(SOAK_ARGS)
+
+golden: $(VENV)/.installed-test
+	PYTHONPATH=tests $(BIN)/python -m soak.golden
 
 check: $(VENV)/.installed-check
 	$(BIN)/ruff format --check .
@@ -59,6 +71,18 @@ docs: $(VENV)/.installed-docs
 build: $(VENV)/.installed-test
 	$(BIN)/python -m build --no-isolation
 
+lock: $(VENV)/.installed-check
+	PYTHONPATH=tests $(BIN)/python -m supply.lock
+
+sbom: $(VENV)/.installed-test
+	PYTHONPATH=tests $(BIN)/python -m supply.sbom dist/sbom.json
+
+licences: $(VENV)/.installed-test
+	PYTHONPATH=tests $(BIN)/python -m supply.licences
+
+audit: $(VENV)/.installed-test
+	PYTHONPATH=tests $(BIN)/python -m supply.audit
+
 clean:
 	rm -rf $(VENV) dist site .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -68,18 +92,23 @@ $(VENV)/bin/pip:
 	  { echo "dnnmso_mj needs Python 3.11 or newer; try: make PYTHON=python3.12" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.installed-run: pyproject.toml constraints.txt | $(VENV)/bin/pip
-	$(PIP) --editable ".[standard]"
+$(VENV)/.installed-run: pyproject.toml $(call locks,run) | $(VENV)/bin/pip
+	$(LOCKED) $(patsubst %,--requirement %,$(call locks,run))
+	$(OURSELVES)
 	@touch $@
 
-$(VENV)/.installed-docs: pyproject.toml constraints.txt | $(VENV)/bin/pip
-	$(PIP) --editable ".[docs]"
-	@touch $@
+$(VENV)/.installed-docs: pyproject.toml $(call locks,run docs) | $(VENV)/bin/pip
+	$(LOCKED) $(patsubst %,--requirement %,$(call locks,run docs))
+	$(OURSELVES)
+	@touch $@ $(VENV)/.installed-run
 
-$(VENV)/.installed-test: pyproject.toml constraints.txt | $(VENV)/bin/pip
-	$(PIP) --editable ".[test]"
+# torch alone is not locked: a machine may serve a build of its own, in constraints.txt's version.
+$(VENV)/.installed-test: pyproject.toml constraints.txt $(call locks,run docs test) | $(VENV)/bin/pip
+	$(LOCKED) $(patsubst %,--requirement %,$(call locks,run docs test))
+	$(INSTALL) --constraint constraints.txt torch
+	$(OURSELVES)
 	@touch $@ $(VENV)/.installed-run $(VENV)/.installed-docs
 
-$(VENV)/.installed-check: pyproject.toml constraints.txt | $(VENV)/bin/pip
-	$(PIP) --editable ".[check]"
-	@touch $@ $(VENV)/.installed-run $(VENV)/.installed-docs $(VENV)/.installed-test
+$(VENV)/.installed-check: $(call locks,check) | $(VENV)/.installed-test
+	$(LOCKED) $(patsubst %,--requirement %,$(call locks,check))
+	@touch $@

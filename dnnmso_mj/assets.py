@@ -12,6 +12,7 @@ from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.wording import show
 
 PREFIX = "asset/"  # of their attachments' names
+LONGEST_NAME = 200  # bytes
 
 
 def read_assets(mjcf: Mjcf) -> dict[str, bytes]:
@@ -40,15 +41,19 @@ def put_back(text: str, files: Mapping[str, bytes], folder: Path) -> Mjcf:
             built from.
 
     Raises:
-        ScenarioError: a file cannot be written, or `dnnmso_mj.mjcf.gate` refuses the model.
+        ScenarioError: a file's name can be none in a folder, or the model is refused.
     """
     root = _root(text)
     numbers: dict[str, int] = {}  # a file is written once, however often it is named
     for element, key, path in list(named(root)):
         data = files.get(PREFIX + path)
-        name = f"{numbers.setdefault(path, len(numbers))}/{Path(path).name}"  # of the element, too
-        if data is not None and Path(name).name != "..":
-            _write(folder / name, data)
+        if data is not None:
+            number = numbers.setdefault(path, len(numbers))
+            name = f"{number}/{_file_name(path)}"  # which may name the element
+            file = folder / name
+            if not file.exists():
+                file.parent.mkdir()
+                file.write_bytes(data)
             element.set(key, name)
     if not any(folder.iterdir()):
         return Mjcf(text)
@@ -58,13 +63,15 @@ def put_back(text: str, files: Mapping[str, bytes], folder: Path) -> Mjcf:
     return Mjcf(ElementTree.tostring(root, encoding="unicode"), str(folder.resolve()))
 
 
-def _write(file: Path, data: bytes) -> None:
-    try:
-        file.parent.mkdir(exist_ok=True)
-        if not file.exists():
-            file.write_bytes(data)
-    except (OSError, ValueError) as error:
-        raise ScenarioError(f"plant.model: its file {show(file.name)}: {error}") from error
+def _file_name(path: str) -> str:
+    """The last part of a path, if it is the name of a file and of nothing else."""
+    name = Path(path).name
+    if name in {"", ".", ".."} or not name.isprintable() or len(name.encode()) > LONGEST_NAME:
+        raise ScenarioError(
+            f"plant.model: the MJCF of a log names the file {show(path)}; allowed: the name of a file, of at "
+            f"most {LONGEST_NAME} bytes"
+        )
+    return name
 
 
 def _root(text: str) -> Tag:

@@ -7,6 +7,7 @@ torques, and is read by joint angle and velocity.
 from __future__ import annotations
 
 import logging
+import math
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,7 +17,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.compiling import compiled, copy, inner, is_finite
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.links import set_links
 from dnnmso_mj.mjcf import gate, read
@@ -347,7 +348,10 @@ class NominalModel:
 
 @inner
 def inertia(nominal: Nominal, q: Array) -> None:
-    """M(q) into `nominal.M`."""
+    """M(q) into `nominal.M`; of a q that is not finite, which MuJoCo never sees, no number is."""
+    if not is_finite(q):
+        nominal.M.fill(math.nan)
+        return
     copy(q, nominal.q)
     mj_kinematics(nominal.model, nominal.data)
     mj_comPos(nominal.model, nominal.data)
@@ -357,7 +361,10 @@ def inertia(nominal: Nominal, q: Array) -> None:
 
 @compiled
 def bias(nominal: Nominal, q: Array, qd: Array) -> None:
-    """V(q, q̇) + G(q) into `nominal.bias`."""
+    """V(q, q̇) + G(q) into `nominal.bias`; as `inertia`."""
+    if not (is_finite(q) and is_finite(qd)):
+        nominal.bias.fill(math.nan)
+        return
     copy(q, nominal.q)
     copy(qd, nominal.qd)
     mj_fwdPosition(nominal.model, nominal.data)
