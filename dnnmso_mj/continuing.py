@@ -110,12 +110,12 @@ class Continuation:
         segments, files = [], dict(self.model.files)
         for part in self.source.segments:
             if part.first < self.last.first:
-                text = self.source.files[part.model]
-                own = text == self.model.text.encode()
+                text = self.source.model(part.model)
+                own = text == self.model.text
                 name = MODEL if own else f"model-{part.first}.xml"
                 segments.append(replace(part, model=name))
                 if not own:
-                    files |= {name: text, **named_files(text.decode(), self.source.files)}
+                    files |= {name: text.encode(), **named_files(text, self.source.files)}
         return [*segments, replace(self.last, model=MODEL)] if segments else [], files
 
 

@@ -130,10 +130,7 @@ def _tick(source: Recorded, at: float) -> int:
 
 def _model(source: Recorded, segment: Segment, folder: Path) -> Model:
     """The model of a segment, from the log alone; its meshes go to a folder."""
-    data = source.files.get(segment.model)
-    if data is None:
-        raise LogError(f"{source.path}: has no attachment {segment.model}; it cannot be resumed")
-    text = data.decode()
+    text = source.model(segment.model)
     files = named_files(text, source.files)
     return Model(put_back(text, files, folder), text, files)
 

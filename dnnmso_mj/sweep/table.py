@@ -12,9 +12,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dnnmso_mj.files import whole_file
+from dnnmso_mj.log.json_texts import read_json
+from dnnmso_mj.sweep.parquet import TableError, read_parquet, write_parquet
 from dnnmso_mj.sweep.plan import Plan, SweepError
 
 METADATA_KEY = b"dnnmso_sweep"
+LARGEST = 1 << 24  # characters of a provenance, which has a scenario for each point
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,7 @@ def write_table(table: pa.Table, out: Path, *, replace: bool = True) -> None:
     """
     try:
         with whole_file(out, replace=replace, sync=True) as file:
-            pq.write_table(table, file)
+            write_parquet(table, file)
     except FileExistsError as error:
         raise SweepError(
             f"{out}: has been made by something else meanwhile, and nothing is written over it; "
@@ -115,9 +118,9 @@ def read_table(path: Path, kind: Kind = SWEEP) -> tuple[pa.Table, dict[str, Any]
         SweepError: not a table of this kind.
     """
     try:
-        table = pq.read_table(path)
-        return table, json.loads(table.schema.metadata[kind.key])
-    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
+        table = read_parquet(path)
+        return table, read_json(table.schema.metadata[kind.key].decode(), LARGEST)
+    except (OSError, TableError, KeyError, TypeError, ValueError) as error:
         raise SweepError(f"{path}: not a table of `{kind.command}`: {error}") from error
 
 

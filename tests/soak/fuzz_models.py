@@ -39,13 +39,14 @@ ATTRIBUTES = (
     "boundmass", "spacing", "dim", "radius", "node", "element", "curve", "initial", "vertcount",
 )  # fmt: skip
 VALUES = (
+    "0.1", "0.5", "2", "0.1 0.2 0.3", "0 1 0", "0.7 0 0.7 0", "x1", "x2",
     "0", "1", "-1", "nan", "inf", "1e308", "1e-320", "1e9", "20000", "2147483648", "-2147483648",
     "0 0 0", "1 0 0 0", "0 0 1", "1 2 3 4 5 6", "true", "false", "auto", "j", "g", "m", "link1",
     "sphere", "box", "mesh", "hfield", "capsule", "plane", "ball", "free", "slide", "hinge", "../x",
     "/etc/passwd", "x.obj", "x.stl", "mujoco.elasticity.cable", "", "a" * 300, "1 " * 200,
 )  # fmt: skip
-WORDS = [*(f"<{tag}" for tag in TAGS), *(f' {name}="' for name in ATTRIBUTES), *VALUES, "/>", "&lt;",
-         "<!DOCTYPE", "<!ENTITY a '", "&a;", "<![CDATA[", "<?xml version='1.0' encoding='", "<!--"]  # fmt: skip
+_MARKS = ("/>", "&lt;", "<!DOCTYPE", "<!ENTITY a '", "&a;", "<![CDATA[", "<?xml encoding='", "<!--")
+WORDS = [*(f"<{tag}" for tag in TAGS), *(f' {name}="' for name in ATTRIBUTES), *VALUES, *_MARKS]
 
 
 def seeds(work: Path) -> list[bytes]:
@@ -110,27 +111,49 @@ def mutate(data: bytes, rng: random.Random, raw: Callable[[bytes, int], bytes]) 
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError):
         return bytes(raw(data, MAX_LEN))
-    for _ in range(rng.randint(1, 3)):
-        elements = list(root.iter())
-        here, other = rng.choice(elements), rng.choice(elements)
-        match rng.randrange(6):
-            case 0:
-                here.set(rng.choice(ATTRIBUTES), rng.choice(VALUES))
-            case 1 if here.attrib:
-                here.set(rng.choice(list(here.attrib)), rng.choice(VALUES))
-            case 2:
-                here.append(
-                    ElementTree.Element(
-                        rng.choice(TAGS), {rng.choice(ATTRIBUTES): rng.choice(VALUES)}
-                    )
-                )
-            case 3 if len(here):
-                here.remove(rng.choice(list(here)))
-            case 4 if other is not root and here not in other.iter():
-                here.append(ElementTree.fromstring(ElementTree.tostring(other)))
-            case _:
-                here.tag = rng.choice(TAGS)
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        here = rng.choice(list(root.iter()))
+        rng.choice((_set, _set, _change, _change, _drop, _add, _cut, _copy, _copy, _rename))(
+            here, rng
+        )
     return ElementTree.tostring(root)
+
+
+def _set(here: ElementTree.Element, rng: random.Random) -> None:
+    here.set(rng.choice(ATTRIBUTES), rng.choice(VALUES))
+
+
+def _change(here: ElementTree.Element, rng: random.Random) -> None:
+    here.set(rng.choice([*here.attrib] or ["name"]), rng.choice(VALUES))
+
+
+def _drop(here: ElementTree.Element, rng: random.Random) -> None:
+    here.attrib.pop(rng.choice([*here.attrib] or ["name"]), None)
+
+
+def _add(here: ElementTree.Element, rng: random.Random) -> None:
+    here.append(ElementTree.Element(rng.choice(TAGS), {rng.choice(ATTRIBUTES): rng.choice(VALUES)}))
+
+
+def _cut(here: ElementTree.Element, rng: random.Random) -> None:
+    if len(here):
+        here.remove(rng.choice(list(here)))
+
+
+def _copy(here: ElementTree.Element, rng: random.Random) -> None:
+    """A copy of one of its children, or of itself, inside; with names of its own."""
+    copy = ElementTree.fromstring(ElementTree.tostring(rng.choice([*here, here])))
+    for number, part in enumerate(copy.iter()):
+        if "name" in part.attrib:
+            part.set("name", f"copy{number}{rng.randrange(1000)}")
+    here.append(copy)
+
+
+def _rename(here: ElementTree.Element, rng: random.Random) -> None:
+    here.tag = rng.choice(TAGS)
+
+
+CHANGES = (_set, _set, _change, _change, _drop, _add, _cut, _copy, _copy, _rename)
 
 
 def target(work: Path) -> Any:

@@ -33,7 +33,10 @@ GUIDED = [
     "dnnmso_mj.paths",
     "dnnmso_mj.assets",
     "dnnmso_mj.links",
+    "dnnmso_mj.mjcf",
+    "dnnmso_mj.recorded",
 ]  # not what numba compiles
+KEEP = 1000  # cases, after which what was found is written
 
 
 def main() -> None:
@@ -42,7 +45,8 @@ def main() -> None:
     warnings.simplefilter("ignore")
     with atheris.instrument_imports(include=GUIDED):
         import dnnmso_mj.loading
-        import dnnmso_mj.reading  # noqa: F401
+        import dnnmso_mj.mjcf
+        import dnnmso_mj.recorded  # noqa: F401
     part: Any = importlib.import_module(f"soak.{MODULES[name]}")
     from soak.fuzz_guard import Guard
 
@@ -64,9 +68,12 @@ def main() -> None:
         (corpus / f"{k:03}").write_bytes(data)
 
     def case(data: bytes) -> None:
+        known = len(guard.found.failures)
         guard(data)
-        if guard.found.cases >= generated + mutated:
+        over = guard.found.cases >= generated + mutated
+        if over or guard.found.cases % KEEP == 0 or len(guard.found.failures) > known:
             (folder / "found.json").write_text(json.dumps(guard.found.as_json()))
+        if over:
             os._exit(0)
 
     _mutate(part, case, folder, seed)
@@ -96,7 +103,7 @@ def _generate(part: Any, guard: Any, seed: int, count: int) -> None:
 
 def _mutate(part: Any, case: Any, folder: Path, seed: int) -> None:
     """Cases that atheris mutates, those first that reach new code; never returns."""
-    words = "\n".join(f'"{_escaped(word)}"' for word in part.WORDS)
+    words = "\n".join(f'"{_escaped(word)}"' for word in dict.fromkeys(part.WORDS) if word)
     (folder / "words.txt").write_text(words + "\n")
     options = [
         f"-dict={folder}/words.txt",
@@ -125,10 +132,10 @@ def _mutate(part: Any, case: Any, folder: Path, seed: int) -> None:
 
 
 def _escaped(word: str) -> str:
-    """As a libFuzzer dictionary has it."""
+    """As a libFuzzer dictionary has it; its words are short."""
     return "".join(
         chr(byte) if 32 <= byte < 127 and byte not in b'"\\' else f"\\x{byte:02x}"
-        for byte in word.encode()
+        for byte in word.encode()[:64]
     )
 
 

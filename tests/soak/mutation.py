@@ -50,6 +50,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         "test_network.py::test_first",
         "test_network.py::test_second",
         "test_network.py::test_a_gradient",
+        "test_network.py::test_reference",
     ),
     "observer.py": ("test_observer.py", "test_control.py::test_observer",),
     "inversion.py": (
@@ -60,8 +61,8 @@ TESTS: dict[str, tuple[str, ...]] = {
         "test_control.py::test_torque",
         "test_control.py::test_closed_form",
     ),
-    "recording.py": ("test_recording.py",),
-    "log/content.py": ("test_recording.py",),
+    "recording.py": ("test_recorder.py", "test_recording.py"),
+    "log/content.py": ("test_recorder.py", "test_recording.py"),
     "log/writer.py": ("test_log_writer.py",),
 }
 

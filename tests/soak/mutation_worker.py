@@ -65,7 +65,9 @@ def plain(function: F) -> F:
 def interpret() -> None:
     """Let everything that is compiled run in the interpreter; before any of it is imported."""
     compiling.compiled = compiling.inner = plain
-    compiling.copy = plain(compiling.copy.py_func)  # type: ignore[attr-defined]
+    for name, value in list(vars(compiling).items()):
+        if hasattr(value, "py_func"):
+            setattr(compiling, name, plain(value.py_func))
     from numba.core.types import ExternalFunction
 
     from dnnmso_mj import mujoco_calls
@@ -95,7 +97,7 @@ def mutate(file: str, source: str) -> None:
                 _transplant(vars(old).get(attribute), member)
         elif getattr(value, "__module__", None) == name and callable(value):
             _transplant(old, value)
-        elif not isinstance(value, types.ModuleType) and not callable(value) and value != old:
+        elif not isinstance(value, types.ModuleType) and value is not old and value != old:
             vars(module)[key] = value
             for other in list(sys.modules.values()):
                 if not isinstance(old, type) and vars(other).get(key, module) is old:

@@ -39,7 +39,7 @@ RUN = ["run", "paper", *SETS, "--no-plot"]
 SWEEP = ["sweep", "paper", *SETS, "--seeds", "0:6", "--jobs", "1"]
 TUNE = [
     *("tune", "paper", *SETS, "--controller", "pd", "--trials", "3", "--seeds", "0:1"),
-    *("--test-seeds", "", "--jobs", "1"),
+    *("--jobs", "1"),
 ]
 DISK = 4 * 2**20
 CLOCK = ("compute_us_p50", "compute_us_p999", "deadline_misses")
