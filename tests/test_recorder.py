@@ -1,4 +1,4 @@
-"""The recorder's promises to whoever calls it, in one process; what is on disk: test_recording.py."""
+"""What the recorder promises whoever calls it, in one process; of files: test_recording.py."""
 
 from __future__ import annotations
 
@@ -73,7 +73,9 @@ def test_the_recorder_counts_ticks_and_takes_single_rows(tmp_path):
         open_log.append(data[1:])
         assert open_log.ticks == 5
         open_log.finish(OK)
-    np.testing.assert_array_equal(read_trace(tmp_path / "run.mcap")["q"], data[:, LAYOUT.slices["q"]])
+    np.testing.assert_array_equal(
+        read_trace(tmp_path / "run.mcap")["q"], data[:, LAYOUT.slices["q"]]
+    )
 
 
 def test_after_a_flush_everything_so_far_can_be_read(tmp_path):
@@ -132,17 +134,22 @@ def test_a_finished_log_is_not_written_again_when_it_is_left(tmp_path):
     assert (log_info(log).status, log_info(log).seed, log_info(log).complete) == ("ok", 3, True)
 
 
+def leave_on_a_full_disk(log: Path, error: Exception | None) -> None:
+    """Whatever is written when the log is left meets the end of the disk."""
+    with full_disk(20_000), recorder(log) as open_log:
+        open_log._background.put_off(lambda: open_log._file.write(bytes(30_000)))
+        if error is not None:
+            raise error
+
+
 def test_the_error_under_way_is_told_rather_than_that_of_the_disk(tmp_path):
-    with full_disk(20_000), pytest.raises(ZeroDivisionError):
-        with recorder(tmp_path / "run.mcap") as open_log:
-            open_log._background.put_off(lambda: open_log._file.write(bytes(30_000)))
-            raise ZeroDivisionError
+    with pytest.raises(ZeroDivisionError):
+        leave_on_a_full_disk(tmp_path / "run.mcap", ZeroDivisionError())
 
 
 def test_a_disk_that_fails_at_the_end_is_told(tmp_path):
-    with full_disk(20_000), pytest.raises(LogError, match=r"run\.mcap cannot be written: File too"):
-        with recorder(tmp_path / "run.mcap") as open_log:
-            open_log._background.put_off(lambda: open_log._file.write(bytes(30_000)))
+    with pytest.raises(LogError, match=r"run\.mcap cannot be written: File too"):
+        leave_on_a_full_disk(tmp_path / "run.mcap", None)
 
 
 def test_nothing_is_left_of_a_log_that_could_not_be_begun(tmp_path):

@@ -22,7 +22,7 @@ import signal
 import sys
 import time
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -201,9 +201,7 @@ def _verdict(items: list[pytest.Item], file: str, source: str, limit: float) -> 
     }
 
 
-def _try(
-    items: list[pytest.Item], file: str, source: str, limit: float, out: int
-) -> None:
+def _try(items: list[pytest.Item], file: str, source: str, limit: float, out: int) -> None:
     """In the child, which never returns."""
     global _OUT  # noqa: PLW0603
     _OUT = out
