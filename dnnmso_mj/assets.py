@@ -6,10 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
+from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.mjcf import Tag, named, parse
 from dnnmso_mj.plant import Mjcf
+from dnnmso_mj.wording import show
 
 PREFIX = "asset/"  # of their attachments' names
+LONGEST_NAME = 200  # bytes
 
 
 def read_assets(mjcf: Mjcf) -> dict[str, bytes]:
@@ -36,15 +39,19 @@ def put_back(text: str, files: Mapping[str, bytes], folder: Path) -> Mjcf:
         files: attachments, by name.
         folder: where to write those that the model names; it must live as long as the model is
             built from.
+
+    Raises:
+        ScenarioError: a file's name can be none in a folder, or the model is refused.
     """
     root = _root(text)
     for number, (element, key, path) in enumerate(list(named(root))):
         data = files.get(PREFIX + path)
         if data is not None:
-            name = f"{number}/{Path(path).name}"  # which may name the element
+            name = f"{number}/{_file_name(path)}"  # which may name the element
             file = folder / name
             file.parent.mkdir(exist_ok=True)
-            file.write_bytes(data)
+            with file.open("xb") as stream:
+                stream.write(data)
             element.set(key, name)
     if not any(folder.iterdir()):
         return Mjcf(text)
@@ -52,6 +59,17 @@ def put_back(text: str, files: Mapping[str, bytes], folder: Path) -> Mjcf:
         for key in ("assetdir", "meshdir", "texturedir", "strippath"):
             compiler.attrib.pop(key, None)
     return Mjcf(ElementTree.tostring(root, encoding="unicode"), str(folder.resolve()))
+
+
+def _file_name(path: str) -> str:
+    """The last part of a path, if it is the name of a file and of nothing else."""
+    name = Path(path).name
+    if name in {"", ".", ".."} or not name.isprintable() or len(name.encode()) > LONGEST_NAME:
+        raise ScenarioError(
+            f"the model of a log names the file {show(path)}; allowed: the name of a file, of at "
+            f"most {LONGEST_NAME} bytes"
+        )
+    return name
 
 
 def _root(text: str) -> Tag:

@@ -66,6 +66,8 @@ def misfit(found: Mapping[str, Array] | None, expected: Mapping[str, Array] | No
             return f"its state has {'no' if name in expected else 'too much:'} {name}"
         if found[name].shape != expected[name].shape:
             return f"{name} had {found[name].shape} entries and has {expected[name].shape}"
+        if found[name].dtype != expected[name].dtype:
+            return f"{name} was of type {found[name].dtype} and is {expected[name].dtype}"
     return ""
 
 

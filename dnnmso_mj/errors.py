@@ -38,6 +38,14 @@ class RunInterrupted(KeyboardInterrupt):
         self.ticks = run.ticks
 
 
+class UnloggedRunError(LogError):
+    """A run that ended because its log could not be written; `run` holds what the log does."""
+
+    def __init__(self, why: str, run: LoggedRun) -> None:
+        super().__init__(why)
+        self.run = run
+
+
 class EndedEarlyError(DnnmsoError):
     """What ends a run before its time; the run says so in its status, and its log is whole."""
 

@@ -44,7 +44,8 @@ def logs_dir() -> Path:
 
 def log_names() -> list[str]:
     """Names of the logs in that folder, the newest first."""
-    logs = ((path.stat().st_mtime_ns, path.stem) for path in Path(LOGS).glob("*.mcap"))
+    found = Path(LOGS).glob("*.mcap")
+    logs = ((path.stat().st_mtime_ns, path.stem) for path in found if _exists(path))
     return [name for _, name in sorted(logs, reverse=True)]
 
 

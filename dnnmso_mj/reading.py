@@ -10,8 +10,9 @@ import numpy as np
 from mcap.records import Attachment
 
 from dnnmso_mj.errors import LogError
-from dnnmso_mj.log.format import create, snapshot_place, unwritable
+from dnnmso_mj.log.format import snapshot_place, unwritable
 from dnnmso_mj.log.npz import read_npz
+from dnnmso_mj.log.place import Place
 from dnnmso_mj.log.prefix import Prefix, copy
 from dnnmso_mj.log.scan import scan, scan_trace
 from dnnmso_mj.log.segments import RESUMED
@@ -119,19 +120,19 @@ def recover(path: str | Path, out: str | Path) -> LogInfo:
         LogError: `path` is no log, or `out` exists or cannot be written; nothing is left behind.
     """
     torn, target = log_info(path), Path(out)
-    file = create(target)
     try:
-        with file:
-            writer = LogWriter(file)
+        place = Place(target)
+        try:
+            writer = LogWriter(place.file)
             # Without its record "run" a log is unfinished, as what was torn must stay.
             prefix = Prefix(torn.path)
             copy(prefix, writer, leave_out=None if torn.complete else "run")
             if prefix.complete != torn.complete:
                 raise LogError(f"{torn.path} was changed while it was read. Recover it again")
             writer.finish()
-    except BaseException as error:
-        target.unlink()
-        if isinstance(error, OSError):
-            raise unwritable(target, error) from error
-        raise
+            place.take()
+        finally:
+            place.give_up()
+    except OSError as error:
+        raise unwritable(target, error) from error
     return log_info(target)

@@ -10,11 +10,12 @@ import numpy as np
 from mcap.records import Attachment
 
 from dnnmso_mj.errors import LogError
-from dnnmso_mj.log.format import snapshot_place
+from dnnmso_mj.log.format import MODEL, snapshot_place
 from dnnmso_mj.log.npz import read_npz
 from dnnmso_mj.log.scan import scan_trace
 from dnnmso_mj.log.segments import Segment, read_segments
 from dnnmso_mj.trace import StepLayout, Trace
+from dnnmso_mj.wording import clean
 
 Array = np.ndarray
 
@@ -50,6 +51,19 @@ class Recorded:
         except ValueError as error:
             t = tick * self.trace.scenario.dt
             raise LogError(f"{self.path}: the snapshot {name} of {t:g} s is {error}") from error
+
+    def model(self, name: str = MODEL) -> str:
+        """The MJCF in an attachment.
+
+        Raises:
+            LogError: there is none, or it is no text.
+        """
+        try:
+            return self.files[name].decode()
+        except KeyError:
+            raise LogError(f"{self.path}: has no attachment {clean(name)}. Run it again") from None
+        except UnicodeDecodeError as error:
+            raise LogError(f"{self.path}: its attachment {clean(name)} is no UTF-8") from error
 
     def segment(self, tick: int) -> Segment:
         """The one that a tick belongs to."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from dnnmso_mj.assets import put_back
 from dnnmso_mj.errors import DnnmsoError, LogError, ScenarioError
 from dnnmso_mj.extras import require
-from dnnmso_mj.log.format import MODEL, unwritable
+from dnnmso_mj.log.format import unwritable
 from dnnmso_mj.plant import build_spec, compile_spec
 from dnnmso_mj.reading import Snapshot
 from dnnmso_mj.recorded import Recorded, read_recorded
@@ -194,16 +194,14 @@ def run_names(logs: Sequence[Path]) -> list[str]:
 
 def _scene(log: Recorded) -> Scene:
     """The robot of a log, from the model that it holds and its scenario's masses and lengths."""
-    data = log.files.get(MODEL)
-    if data is None:
-        raise LogError(f"{log.path}: no attachment {MODEL!r} to draw the robot from. Run it again.")
+    text = log.model()
     scenario = log.trace.scenario
     try:
         with tempfile.TemporaryDirectory() as folder:
-            mjcf = put_back(data.decode(), log.files, Path(folder))
+            mjcf = put_back(text, log.files, Path(folder))
             spec = build_spec(scenario.plant, scenario.dt, mjcf)
             return Scene(compile_spec(spec, scenario.plant.model))
-    except (ScenarioError, UnicodeDecodeError) as error:
+    except ScenarioError as error:
         raise LogError(f"{log.path}: its robot cannot be drawn: {error}") from error
 
 

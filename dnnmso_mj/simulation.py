@@ -14,7 +14,7 @@ from numba.core import event
 
 from dnnmso_mj.compile_loop import compile_elsewhere, compile_halves_elsewhere
 from dnnmso_mj.compiling import CompileNotice
-from dnnmso_mj.controllers import Controller, build_controller, compiled_ticks
+from dnnmso_mj.controllers import Controller, build_controller, compiled_ticks, no_command
 from dnnmso_mj.divergence import not_finite
 from dnnmso_mj.errors import EndedEarlyError, NonFiniteError
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK, MemoryRecorder
@@ -140,8 +140,9 @@ class Simulation:
                 state = self.controller.state()
                 self._start()
                 begin_tick(world, 0)
-                self._command = self.controller.update(world.inputs)  # also if tick 0 comes late
-                end_tick(world, self._command, 0)
+                command = self.controller.update(world.inputs)
+                end_tick(world, command, 0)
+                self._command = no_command(command)  # of a first tick that is begun too late
                 self.controller.restore(state)
 
     def _start(self) -> None:
@@ -155,13 +156,13 @@ class Simulation:
             EndedEarlyError: the run ends before them; rows of before are recorded.
         """
         stage, snapshot_every = self.stage, self.snapshot_every
-        most = min(getattr(recorder, "block", BLOCK), LARGEST_BLOCK)
         stage.world.counts[START_NS] = time.monotonic_ns() + HEAD_START_NS
         while stage.tick < n_ticks:
             first = stage.tick
             if first % snapshot_every == 0:
                 self._check_controller()
                 self._give_state(recorder)
+            most = min(getattr(recorder, "block", BLOCK), LARGEST_BLOCK)
             end = min(stage.open_block(recorder, most), n_ticks)
             count = min(end, (first // snapshot_every + 1) * snapshot_every) - first
             self._run_block(first, count, recorder)

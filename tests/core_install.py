@@ -1,7 +1,7 @@
 """No tests: an installation of the core alone, made of links to what is installed here.
 
 A real virtual environment, in which there is nothing but what the core asks for, what that asks for
-in turn, and this package's own metadata; its code is the checkout's, so that compiled loops serve.
+in turn, and this package's own metadata; its code is the one that is tested, so that compiled loops serve.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from importlib.metadata import Distribution, distribution, requires
 from pathlib import Path
 
 from packaging.requirements import Requirement
+
+from dnnmso_mj.paths import PACKAGE
 
 ROOT = Path(__file__).parents[1]
 
@@ -58,7 +60,7 @@ def make_core(folder: Path) -> Path:
     build = "import sys; from hatchling.build import prepare_metadata_for_build_wheel as make;"
     command = [sys.executable, "-c", f"{build} make(sys.argv[1])", str(site)]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-    (site / "dnnmso_mj.pth").write_text(f"{ROOT}\n")
+    (site / "dnnmso_mj").symlink_to(PACKAGE)
     return folder / "bin" / "python"
 
 

@@ -41,7 +41,7 @@ def test_every_name_is_there_and_only_those():
 
 
 def test_type_checkers_see_the_names_where_they_are():
-    tree = ast.parse((ROOT / "dnnmso_mj" / "__init__.py").read_text())
+    tree = ast.parse(Path(dnnmso_mj.__file__).read_text())
     imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
     seen = {name.name: node.module for node in imports for name in node.names}
     expected = {name: f"dnnmso_mj.{home}" for name, home in dnnmso_mj._HOMES.items()}
@@ -49,7 +49,7 @@ def test_type_checkers_see_the_names_where_they_are():
 
 
 def test_no_module_hides_a_name_that_it_is_called_like():
-    modules = {path.stem for path in (ROOT / "dnnmso_mj").iterdir()}
+    modules = {path.stem for path in Path(dnnmso_mj.__file__).parent.iterdir()}
     assert not modules & set(dnnmso_mj.__all__)
 
 

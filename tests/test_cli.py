@@ -19,6 +19,7 @@ from listening import DNNMSO, started
 from trace_samples import METRICS
 
 from dnnmso_mj.loading import list_scenarios
+from dnnmso_mj.paths import PACKAGE
 from dnnmso_mj.reading import read_trace
 
 ROOT = Path(__file__).parents[1]
@@ -340,7 +341,7 @@ def test_an_output_that_knows_only_ascii_gets_what_it_knows(tmp_path):
 def test_no_place_for_compiled_code_says_what_to_set(tmp_path):
     """Files and /proc, where folders should be, stand for those that cannot be written."""
     package = tmp_path / "dnnmso_mj"
-    shutil.copytree(ROOT / "dnnmso_mj", package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
     for folder in [package, *(path for path in package.rglob("*") if path.is_dir())]:
         (folder / "__pycache__").write_text("")
     for name in ("models", "scenarios"):

@@ -155,6 +155,29 @@ def test_a_controller_that_overruns_is_found_out_in_an_interpreted_loop_too(
     assert sum(miss.cause == "computing" and miss.ticks >= 10 for miss in long) == 2
 
 
+class SlowAtFirst(MemoryRecorder):
+    """A recorder that takes 50 ms for the state before the first tick."""
+
+    def snapshot(self, name, t, arrays):
+        time.sleep(0.05 if t == 0.0 else 0.0)
+        super().snapshot(name, t, arrays)
+
+
+@pytest.mark.parametrize("interpreted", [False, True])
+def test_a_first_tick_that_is_begun_too_late_is_the_watchdogs(make_scenario, two_link, interpreted):
+    spec = make_scenario({"kind": "no_network"}, duration=0.3, dt=0.005)
+    controller = Dozing(Simulation(spec, two_link).controller, set()) if interpreted else None
+    simulation = Simulation(spec, two_link, pace=real_time_pace(spec), controller=controller)
+    recorder = SlowAtFirst(simulation.layout, spec.n_ticks)
+    info = simulation.run(recorder)
+    trace = recorder.trace(spec, info)
+    assert len(trace) == spec.n_ticks
+    assert trace["deadline_missed"][0]
+    assert trace["compute_us"][0] == 0
+    assert not trace["tau_cmd"][0].any()
+    assert not trace["tau"][0].any()
+
+
 def test_a_process_that_is_not_run_misses_by_waking(tmp_path):
     """Four SIGSTOPs of 50 ms each: as many rows of misses, none blamed on computing."""
     log = tmp_path / "stopped.mcap"

@@ -22,7 +22,7 @@ from dnnmso_mj.cli.shared import (
     print_table,
     progress_bar,
 )
-from dnnmso_mj.errors import RunInterrupted
+from dnnmso_mj.errors import RunInterrupted, UnloggedRunError
 from dnnmso_mj.wording import show
 
 if TYPE_CHECKING:
@@ -58,6 +58,9 @@ def resume(
         if stop.ticks or as_json:
             tell(stop.run, [], as_json=as_json, real_time=False)
         raise KeyboardInterrupt(f"log: {near(stop.log)} ({stop.ticks} ticks)") from stop
+    except UnloggedRunError as error:
+        tell(error.run, [], as_json=as_json, real_time=False)
+        raise
     figures, undrawn = draw(done.run) if plot else ([], None)
     _tell(done, log, sets, figures, as_json=as_json)
     info = done.run.info

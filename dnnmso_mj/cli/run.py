@@ -24,7 +24,13 @@ from dnnmso_mj.cli.shared import (
     progress_bar,
     working,
 )
-from dnnmso_mj.errors import DnnmsoError, MissingExtraError, RunInterrupted, ScenarioError
+from dnnmso_mj.errors import (
+    DnnmsoError,
+    MissingExtraError,
+    RunInterrupted,
+    ScenarioError,
+    UnloggedRunError,
+)
 from dnnmso_mj.extras import require
 
 if TYPE_CHECKING:
@@ -32,6 +38,7 @@ if TYPE_CHECKING:
     from dnnmso_mj.timing import Timing
 
 MISSES_SHOWN = 20
+ENDED_EARLY = ("interrupted", "failed")
 UNITS = {
     "rmse": "rad",
     "rmse_steady": "rad",
@@ -85,6 +92,9 @@ def run(
                 tell(stop.run, [], as_json=as_json, real_time=real_time)
             ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
             raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
+        except UnloggedRunError as error:
+            tell(error.run, [], as_json=as_json, real_time=False)
+            raise
         figures, undrawn = draw(done) if plot else ([], None)
         tell(done, figures, as_json=as_json, real_time=real_time)
     if undrawn is not None:
@@ -112,7 +122,8 @@ def draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
 
     try:
         with working("drawing figures"):
-            return save_figures(done.drawn(), done.log.parent, done.log.stem), None
+            name = done.log.name.removesuffix(".mcap")
+            return save_figures(done.drawn(), done.log.parent, name), None
     except DnnmsoError as error:
         return [], error
 
@@ -153,7 +164,7 @@ def print_summary(done: LoggedRun, figures: list[Path], since: int = 0) -> None:
         table.add_row(name, number(value), UNITS.get(name, ""))
     print_table(table, soft_wrap=True)
     simulated = (done.ticks - since) * scenario.dt
-    whole = f" of {scenario.duration:g} s" if info.status == "interrupted" else ""
+    whole = f" of {scenario.duration:g} s" if info.status in ENDED_EARLY else ""
     print(f"{simulated:g} s{whole} simulated in {info.wall_s:.2f} s")
     print(f"log      {near(done.log)}")
     for figure in figures:

@@ -93,6 +93,18 @@ class Command(NamedTuple):
     monitors: Monitors  # of the network's update; empty without a network
 
 
+def no_command(like: Command) -> Command:
+    """What stands in the log until a controller's first command: zeros, as many as it will have."""
+    return Command(
+        tau=np.zeros_like(like.tau),
+        Bu=np.zeros_like(like.Bu),
+        x_hat=np.zeros_like(like.x_hat),
+        f_hat=np.zeros_like(like.f_hat),
+        e_obs=np.zeros_like(like.e_obs),
+        monitors=Monitors(*map(np.zeros_like, like.monitors)),
+    )
+
+
 def command_of(inversion: DynamicInversion, e_obs: Array, monitors: Monitors) -> Command:
     """A command that shows what these parts hold, with its own x_hat and f_hat."""
     x_hat, f_hat = np.zeros((2, e_obs.size))

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from dnnmso_mj.log import limits
+from dnnmso_mj.log.prefix import Prefix
 from dnnmso_mj.log.scan import Scan, scan
 from dnnmso_mj.trace import StepLayout
 
@@ -17,14 +19,20 @@ Columns = dict[str, Array]
 class _Blocks:
     """Collects rows until they fill a block."""
 
-    def __init__(self, take: Callable[[Columns], None], ticks: int) -> None:
-        self._take, self._ticks = take, ticks
+    def __init__(self, take: Callable[[Columns], None], ticks: int, size: int) -> None:
+        self._take, self._ticks, self._most = take, ticks, limits.rows(size)
         self._layout: StepLayout | None = None
         self._filled = 0
 
     def add(self, layout: StepLayout, rows: Array) -> None:
-        """Take the next rows."""
+        """Take the next rows.
+
+        Raises:
+            ValueError: a block of them is too large for the file.
+        """
         if self._layout is None:
+            if 8 * self._ticks * layout.width > self._most:
+                raise ValueError(f"rows of {layout.width} numbers: too wide for its size")
             self._layout = layout
             self._rows = np.empty((self._ticks, layout.width))
         while len(rows):
@@ -53,7 +61,7 @@ def scan_blocks(path: Path, take: Callable[[Columns], None], ticks: int) -> Scan
     Raises:
         LogError: the file is no log of this package.
     """
-    blocks = _Blocks(take, ticks)
+    blocks = _Blocks(take, ticks, Prefix(path).size)
     found = scan(path, blocks.add)
     blocks.end()
     return found

@@ -9,7 +9,6 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -17,7 +16,6 @@ from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap.writer import MCAP0_MAGIC
 
 from dnnmso_mj.errors import LogError
 from dnnmso_mj.log import step_message
@@ -71,47 +69,6 @@ STEP = Topic(
     encoding="protobuf",
 )
 EVENTS = protobuf_topic("/events", Log.DESCRIPTOR.file, "foxglove.Log")
-
-
-def create(path: Path, force: bool = False) -> BinaryIO:
-    """Open a new file, in a folder that is made when missing.
-
-    Raises:
-        LogError: the file exists and `force` does not say to remove it, or is no log, or cannot be
-            written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if force:
-            _remove_log(path)
-        return _open_new(path)
-    except OSError as error:
-        raise unwritable(path, error) from error
-
-
-def _remove_log(path: Path) -> None:
-    """Remove a file that begins like a log; what is no log is never removed."""
-    if not path.exists():
-        return
-    magic = b""
-    if path.is_file():  # opening a FIFO would wait for a writer
-        with path.open("rb") as file:
-            magic = file.read(len(MCAP0_MAGIC))
-    if magic != MCAP0_MAGIC:
-        raise LogError(
-            f"{path} is no log (an MCAP file), and --force replaces nothing else. "
-            "Choose another name."
-        )
-    path.unlink()
-
-
-def _open_new(path: Path) -> BinaryIO:
-    try:
-        return path.open("xb")
-    except FileExistsError as error:
-        raise LogError(
-            f"{path} exists already. Choose another name, or replace it with --force."
-        ) from error
 
 
 def unwritable(path: Path, error: OSError) -> LogError:

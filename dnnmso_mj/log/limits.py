@@ -14,7 +14,7 @@ MIB = 1 << 20
 CHUNK = 16 * MIB  # of one chunk's content; ours have 64 KiB
 DEFINITIONS = MIB  # of all schemas and channels
 METADATA = 2 * MIB  # of all metadata records
-JSON_TEXT, JSON_VALUES = MIB, 100_000  # of a text in one
+JSON_TEXT = MIB  # of a text in one; a tenth of it values
 STEP = MIB  # of one message on /step
 JOINTS = LAYERS = 1000
 

@@ -6,8 +6,8 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 from mcap.writer import MCAP0_MAGIC
 
@@ -20,7 +20,7 @@ class NotRegularError(OSError):
     """A directory, a FIFO, a socket or a device; `strerror` says which."""
 
 
-def open_regular(path: Path) -> tuple[BinaryIO, int]:
+def open_regular(path: Path) -> tuple[BufferedReader, int]:
     """Open a regular file, and tell its size as it is now.
 
     Nothing is mapped into memory: where somebody cuts the file meanwhile, less is read, but a
@@ -45,7 +45,7 @@ def open_regular(path: Path) -> tuple[BinaryIO, int]:
 
 
 @contextmanager
-def open_mcap(path: Path) -> Iterator[tuple[BinaryIO, int]]:
+def open_mcap(path: Path) -> Iterator[tuple[BufferedReader, int]]:
     """A file that begins like an MCAP, behind these first bytes, and its size.
 
     Raises:

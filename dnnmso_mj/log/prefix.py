@@ -10,8 +10,8 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator
 from dataclasses import replace
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -76,7 +76,7 @@ class Prefix:
 class _Walk:
     """One pass over a file, its checksums compared; DamagedError where it goes no further."""
 
-    def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
+    def __init__(self, path: Path, file: BufferedReader, size: int) -> None:
         self._file, self._size = _Source(path, file, size), size
         self._order = _Order()
         self._path = path
@@ -155,7 +155,7 @@ class _Walk:
 class _Source:
     """The records of a file, one after the other, and the checksum of what has been read."""
 
-    def __init__(self, path: Path, file: BinaryIO, size: int) -> None:
+    def __init__(self, path: Path, file: BufferedReader, size: int) -> None:
         self._path, self._file, self._size = path, file, size
         self._at = len(MCAP0_MAGIC)
         self.crc = zlib.crc32(MCAP0_MAGIC)  # of all before `_at`

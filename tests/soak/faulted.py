@@ -69,7 +69,7 @@ def check_rows(trace: Trace, clean: Trace, tick: int) -> None:
     """Every tick before the fault is there, as it was without; and what is there is finite."""
     assert len(trace) >= tick, f"{len(trace)} ticks; the fault came before tick {tick}"
     assert np.array_equal(trace["t"], np.arange(len(trace)) * trace.scenario.dt), "a hole in time"
-    for name in set(trace) - CLOCKED:
+    for name in set(trace) - set(CLOCKED):
         same = np.array_equal(trace[name][:tick], clean[name][:tick])
         assert same, f"{name} differs before the fault"
         assert np.isfinite(trace[name]).all(), f"{name} is not finite in the log"
