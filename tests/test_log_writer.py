@@ -242,7 +242,10 @@ def written() -> bytes:
     writer.add_metadata("one", {"key": "value"})
     writer.add_attachment(7, "first.bin", "application/x-first", b"123")
     schema = writer.add_schema("Thing", "jsonschema", b"{}")
-    channels = [writer.add_channel(f"/{name}", "json", id) for name, id in zip("ab", (schema, 0), strict=True)]
+    channels = [
+        writer.add_channel(f"/{name}", "json", id)
+        for name, id in zip("ab", (schema, 0), strict=True)
+    ]
     other = writer.add_schema("Other", "protobuf", b"other")
     writer.add_channel("/unused", "protobuf", other)
     writer.add_message(channels[0], 500, b"{}")
@@ -294,7 +297,10 @@ def test_each_index_says_where_and_what_its_record_is(written: bytes) -> None:
     before, footer = parts_of(written)
     summary = make_reader(io.BytesIO(written)).get_summary()
     kinds = {
-        Opcode.CHUNK: (Chunk, [(c.chunk_start_offset, c.chunk_length) for c in summary.chunk_indexes]),
+        Opcode.CHUNK: (
+            Chunk,
+            [(c.chunk_start_offset, c.chunk_length) for c in summary.chunk_indexes],
+        ),
         Opcode.ATTACHMENT: (Attachment, [(a.offset, a.length) for a in summary.attachment_indexes]),
         Opcode.METADATA: (Metadata, [(m.offset, m.length) for m in summary.metadata_indexes]),
     }

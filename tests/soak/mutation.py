@@ -51,7 +51,10 @@ TESTS: dict[str, tuple[str, ...]] = {
         "test_network.py::test_second",
         "test_network.py::test_a_gradient",
     ),
-    "observer.py": ("test_observer.py", "test_control.py::test_observer",),
+    "observer.py": (
+        "test_observer.py",
+        "test_control.py::test_observer",
+    ),
     "inversion.py": (
         "test_control.py::test_command",
         "test_control.py::test_perfect",

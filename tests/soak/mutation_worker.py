@@ -199,9 +199,7 @@ def _verdict(items: list[pytest.Item], file: str, source: str, limit: float) -> 
     }
 
 
-def _try(
-    items: list[pytest.Item], file: str, source: str, limit: float, out: int
-) -> None:
+def _try(items: list[pytest.Item], file: str, source: str, limit: float, out: int) -> None:
     """In the child, which never returns."""
     global _OUT  # noqa: PLW0603
     _OUT = out

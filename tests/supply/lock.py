@@ -58,7 +58,9 @@ class Locked:
     @property
     def text(self) -> str:
         """As it stands in the file."""
-        return " \\\n".join([str(self.requirement), *(f"    --hash={h}" for h in self.hashes)]) + "\n"
+        return (
+            " \\\n".join([str(self.requirement), *(f"    --hash={h}" for h in self.hashes)]) + "\n"
+        )
 
 
 def lock_file(group: str) -> Path:
