@@ -369,3 +369,10 @@ def test_a_log_is_broken_only_once_it_could_not_be_written(tmp_path):
     with full_disk(20_000), pytest.raises(LogError):
         repeat(lambda log: log.append(rows(40)), log)
     assert log.broken is True
+
+
+def test_a_snapshot_that_is_refused_is_named(tmp_path):
+    with recorder(tmp_path / "run.mcap") as log:
+        with pytest.raises(LogError, match="^snapshot 'net': array 'W' has dtype object; allowed"):
+            log.snapshot("net", 0.0, {"v": np.ones(1), "W": np.array([None])})
+        log.finish(OK)
