@@ -373,6 +373,20 @@ def test_a_log_is_broken_only_once_it_could_not_be_written(tmp_path):
 
 def test_a_snapshot_that_is_refused_is_named(tmp_path):
     with recorder(tmp_path / "run.mcap") as log:
-        with pytest.raises(LogError, match="^snapshot 'net': array 'W' has dtype object; allowed"):
+        with pytest.raises(LogError, match=r"^snapshot 'net': array 'W' has dtype object; allowed"):
             log.snapshot("net", 0.0, {"v": np.ones(1), "W": np.array([None])})
         log.finish(OK)
+
+
+def test_what_was_written_can_be_read_even_where_its_name_was_taken_away(tmp_path):
+    with recorder(tmp_path / "run.mcap") as log:
+        log.append(rows(60))
+        log.flush()
+        assert log.readable == log.path
+        log.path.rename(tmp_path / "moved.mcap")
+        assert log.readable != log.path
+        assert log.readable.read_bytes() == (tmp_path / "moved.mcap").read_bytes()
+        with pytest.raises(LogError, match="moved or removed while the run was writing"):
+            log.finish(OK)
+        assert log.broken is True
+        assert log.readable == log.path
