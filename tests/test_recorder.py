@@ -13,7 +13,7 @@ import pytest
 from log_samples import LAYOUT, MJCF, OK, recorder, rows, scenario, scene
 from mcap.reader import make_reader
 from mcap.records import Attachment
-from test_recording import full_disk
+from test_recording import full_disk, repeat
 
 from dnnmso_mj import recording
 from dnnmso_mj.errors import LogError
@@ -317,20 +317,27 @@ def test_a_paced_run_of_long_ticks_begins_with_blocks_as_short(tmp_path):
 def gate() -> Iterator[threading.Event]:
     """What the writing thread waits for; it opens by itself rather than to hang a test."""
     closed = threading.Event()
-    opener = threading.Timer(0.5, closed.set)
+    opener = threading.Timer(20.0, closed.set)
     opener.start()
     yield closed
     closed.set()
-    opener.join()
+    opener.cancel()
+
+
+def append_behind(log: McapRecorder, gate: threading.Event) -> None:
+    """Append a row, which waits until the gate is opened meanwhile."""
+    assert (log.waited_s, gate.is_set()) == (0.0, False)
+    threading.Timer(0.05, gate.set).start()
+    log.append(rows(1))
+    assert gate.is_set()
+    assert log.waited_s > 0.0
 
 
 def test_a_run_without_deadlines_waits_for_one_block_behind_it(tmp_path, gate):
     with recorder(tmp_path / "run.mcap") as log:
         log._background.put(gate.wait)
         log.append(rows(40))
-        assert (log.waited_s, gate.is_set()) == (0.0, False)
-        log.append(rows(1))
-        assert log.waited_s > 0.0
+        append_behind(log, gate)
         log.finish(OK)
 
 
@@ -339,9 +346,7 @@ def test_a_snapshot_counts_among_what_waits(tmp_path, gate):
         log._background.put(gate.wait)
         log.snapshot("net", 0.0, {"W": np.zeros(20 * LAYOUT.width), "v": np.zeros(LAYOUT.width)})
         log.append(rows(19))
-        assert (log.waited_s, gate.is_set()) == (0.0, False)
-        log.append(rows(1))
-        assert log.waited_s > 0.0
+        append_behind(log, gate)
         log.finish(OK)
 
 
@@ -351,6 +356,7 @@ def test_a_run_with_deadlines_does_not_wait(tmp_path, gate):
         log._background.put(gate.wait)
         log.append(rows(400))
         assert (log.waited_s, gate.is_set()) == (0.0, False)
+        gate.set()
         log.finish(OK)
 
 
@@ -359,7 +365,28 @@ def test_a_log_is_broken_only_once_it_could_not_be_written(tmp_path):
         assert log.broken is False
         log.finish(OK)
     assert log.broken is False
-    with pytest.raises(LogError), full_disk(20_000), recorder(tmp_path / "torn.mcap") as log:
-        log.append(rows(400))
-        log.flush()
+    log = recorder(tmp_path / "torn.mcap")
+    with full_disk(20_000), pytest.raises(LogError):
+        repeat(lambda log: log.append(rows(40)), log)
     assert log.broken is True
+
+
+def test_a_snapshot_that_is_refused_is_named(tmp_path):
+    with recorder(tmp_path / "run.mcap") as log:
+        with pytest.raises(LogError, match=r"^snapshot 'net': array 'W' has dtype object; allowed"):
+            log.snapshot("net", 0.0, {"v": np.ones(1), "W": np.array([None])})
+        log.finish(OK)
+
+
+def test_what_was_written_can_be_read_even_where_its_name_was_taken_away(tmp_path):
+    with recorder(tmp_path / "run.mcap") as log:
+        log.append(rows(60))
+        log.flush()
+        assert log.readable == log.path
+        log.path.rename(tmp_path / "moved.mcap")
+        assert log.readable != log.path
+        assert log.readable.read_bytes() == (tmp_path / "moved.mcap").read_bytes()
+        with pytest.raises(LogError, match="moved or removed while the run was writing"):
+            log.finish(OK)
+        assert log.broken is True
+        assert log.readable == log.path

@@ -94,7 +94,7 @@ def mutate(file: str, source: str) -> None:
             continue
         if isinstance(value, type) and value.__module__ == name:
             for attribute, member in vars(value).items():
-                _transplant(vars(old).get(attribute), member)
+                _transplant(vars(old).get(attribute), member, old)
         elif getattr(value, "__module__", None) == name and callable(value):
             _transplant(old, value)
         elif not isinstance(value, types.ModuleType) and value is not old and value != old:
@@ -104,14 +104,20 @@ def mutate(file: str, source: str) -> None:
                     setattr(other, key, value)
 
 
-def _transplant(old: Any, new: Any) -> None:
-    """Code and defaults of a function, of what it wraps, or of a property, into the old one."""
+def _transplant(old: Any, new: Any, owner: type | None = None) -> None:
+    """Code and defaults of a function, of what it wraps, or of a property, into the old one.
+
+    A method of `owner` that no longer says `super()` is put in the old one's place.
+    """
     if isinstance(new, property):
         old, new = old.fget, new.fget
     old, new = inspect.unwrap(old), inspect.unwrap(new)
     if isinstance(new, types.FunctionType):
         if len(old.__code__.co_freevars) != len(new.__code__.co_freevars):
-            raise UnfitError(new.__qualname__)
+            if owner is None or new.__code__.co_freevars:
+                raise UnfitError(new.__qualname__)
+            setattr(owner, new.__name__, new)
+            return
         old.__code__, old.__defaults__ = new.__code__, new.__defaults__
         old.__kwdefaults__ = new.__kwdefaults__
 
