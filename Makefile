@@ -12,13 +12,14 @@ PYTEST_ARGS ?=
 
 SOAK_ARGS = $(if $(ROW),--row $(ROW)) $(if $(SEED),--seed $(SEED)) $(if $(SHORT),--short)
 
-.PHONY: help run test soak check format figures experiments schema docs build lock sbom licences \
-  audit clean
+.PHONY: help run test soak golden check format figures experiments schema docs build lock sbom \
+  licences audit clean
 
 help:
 	@echo "make run      install, run $(SCENARIO), print where the log and the figures are"
 	@echo "make test     install what the tests need and run them all"
 	@echo "make soak     prove what docs/reliability.md says, in under two hours; ROW=5 one row of it"
+	@echo "make golden   write this machine's golden hashes into tests/golden.json"
 	@echo "make check    format, lint and type checks"
 	@echo "make format   format and fix what can be fixed"
 	@echo "make figures  draw the pictures of the README and docs anew"
@@ -40,6 +41,9 @@ test: $(VENV)/.installed-test
 
 soak: $(VENV)/.installed-test
 	PYTHONPATH=tests $(BIN)/python -m soak $(SOAK_ARGS)
+
+golden: $(VENV)/.installed-test
+	PYTHONPATH=tests $(BIN)/python -m soak.golden
 
 check: $(VENV)/.installed-check
 	$(BIN)/ruff format --check .

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
+from dnnmso_mj.errors import ScenarioError
+from dnnmso_mj.mjcf import Tag, named, parse
 from dnnmso_mj.plant import Mjcf
+from dnnmso_mj.wording import show
 
 PREFIX = "asset/"  # of their attachments' names
-FOLDERS = {"mesh": "meshdir", "hfield": "meshdir", "skin": "meshdir", "texture": "texturedir"}
+LONGEST_NAME = 200  # bytes
 
 
 def read_assets(mjcf: Mjcf) -> dict[str, bytes]:
     """The files that a model names, by the names of their attachments."""
     files = {}
-    for _, _, path in _named(_root(mjcf.text)):
+    for _, _, path in named(_root(mjcf.text)):
         file = Path(mjcf.folder) / path
         if file.is_file():
             files[PREFIX + path] = file.read_bytes()
@@ -24,7 +27,7 @@ def read_assets(mjcf: Mjcf) -> dict[str, bytes]:
 
 def named_files(text: str, files: Mapping[str, bytes]) -> dict[str, bytes]:
     """Of a log's attachments, those that the MJCF `text` names."""
-    names = [PREFIX + path for _, _, path in _named(_root(text))]
+    names = [PREFIX + path for _, _, path in named(_root(text))]
     return {name: files[name] for name in names if name in files}
 
 
@@ -36,42 +39,40 @@ def put_back(text: str, files: Mapping[str, bytes], folder: Path) -> Mjcf:
         files: attachments, by name.
         folder: where to write those that the model names; it must live as long as the model is
             built from.
+
+    Raises:
+        ScenarioError: a file's name can be none in a folder, or the model is refused.
     """
     root = _root(text)
-    found = False
-    for number, (element, key, path) in enumerate(list(_named(root))):
+    numbers: dict[str, int] = {}  # a file is written once, however often it is named
+    for element, key, path in list(named(root)):
         data = files.get(PREFIX + path)
         if data is not None:
-            file = folder.resolve() / str(number) / Path(path).name  # which may name the element
-            file.parent.mkdir(exist_ok=True)
-            file.write_bytes(data)
-            element.set(key, str(file))
-            found = True
-    if not found:
+            number = numbers.setdefault(path, len(numbers))
+            name = f"{number}/{_file_name(path)}"  # which may name the element
+            file = folder / name
+            if not file.exists():
+                file.parent.mkdir()
+                file.write_bytes(data)
+            element.set(key, name)
+    if not any(folder.iterdir()):
         return Mjcf(text)
     for compiler in root.iter("compiler"):
-        compiler.set("strippath", "false")
-    return Mjcf(ElementTree.tostring(root, encoding="unicode"))
+        for key in ("assetdir", "meshdir", "texturedir", "strippath"):
+            compiler.attrib.pop(key, None)
+    return Mjcf(ElementTree.tostring(root, encoding="unicode"), str(folder.resolve()))
 
 
-def _root(text: str) -> ElementTree.Element:
-    try:
-        return ElementTree.fromstring(text)  # noqa: S314
-    except ElementTree.ParseError:  # MuJoCo takes more than is XML; of that, no files are kept
-        return ElementTree.Element("mujoco")
+def _file_name(path: str) -> str:
+    """The last part of a path, if it is the name of a file and of nothing else."""
+    name = Path(path).name
+    if name in {"", ".", ".."} or not name.isprintable() or len(name.encode()) > LONGEST_NAME:
+        raise ScenarioError(
+            f"plant.model: the MJCF of a log names the file {show(path)}; allowed: the name of a file, of at "
+            f"most {LONGEST_NAME} bytes"
+        )
+    return name
 
 
-def _named(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str, str]]:
-    """Every element that names a file, in which attribute, and its path from the model's folder."""
-    settings: dict[str, str] = {}
-    for compiler in root.iter("compiler"):
-        settings |= compiler.attrib
-    shared = settings.get("assetdir", "")
-    strips = settings.get("strippath") == "true"
-    for element in root.iter():
-        if element.tag not in FOLDERS:
-            continue
-        folder = settings.get(FOLDERS[element.tag], shared)
-        for key, path in element.attrib.items():
-            if key.startswith("file") and path:
-                yield element, key, str(Path(folder) / (Path(path).name if strips else path))
+def _root(text: str) -> Tag:
+    return parse(text.encode("utf-8", "surrogatepass"), "the MJCF of a log")

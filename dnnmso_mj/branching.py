@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dnnmso_mj.scenario import External, Policy, Scenario
+from dnnmso_mj.scenario import External, Policy, Scenario, expand
 from dnnmso_mj.scenario.controller import inversion
 from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.theory import UNDEFINED, TrackingBounds, start_bounds
@@ -20,9 +20,9 @@ def branch(state: State, before: Scenario, simulation: Simulation) -> tuple[Stat
 
     The arm keeps q and q̇. A controller of the same kind keeps its state where all its arrays have
     the shapes that they had; any other begins anew with the present reading. Delays keep the newest
-    of what is on its way, and go on from the oldest where they have become longer. Imperfections
-    from outside go on where they are the same code. Bounds begin anew where the reference or the
-    law that they are of is another.
+    of what is on its way, and go on from the oldest where they have become longer; a lower torque
+    limit holds for it at once. Imperfections from outside go on where they are the same code.
+    Bounds begin anew where the reference or the law that they are of is another.
 
     Args:
         state: of the run so far.
@@ -38,6 +38,11 @@ def branch(state: State, before: Scenario, simulation: Simulation) -> tuple[Stat
     world = dict(state.world)
     for name in ("actuators_past", "sensors_past"):
         world[name] = _refill(world[name], len(fresh.world[name]), state.tick)
+    limit = now.imperfections.torque_limit
+    if limit is not None:
+        most = expand(limit, now.n_joints)
+        for name in ("actuators_past", "actuators_held"):
+            world[name] = np.clip(world[name], -most, most)
     codes = [[part.python for part in each.imperfections.external] for each in (before, now)]
     if codes[0] != codes[1]:
         kept = {name: values for name, values in world.items() if not name.startswith(EXTERNAL)}
@@ -61,6 +66,8 @@ def misfit(found: Mapping[str, Array] | None, expected: Mapping[str, Array] | No
             return f"its state has {'no' if name in expected else 'too much:'} {name}"
         if found[name].shape != expected[name].shape:
             return f"{name} had {found[name].shape} entries and has {expected[name].shape}"
+        if found[name].dtype != expected[name].dtype:
+            return f"{name} was of type {found[name].dtype} and is {expected[name].dtype}"
     return ""
 
 

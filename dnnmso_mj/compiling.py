@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from typing import Any, Literal, TypeVar, cast
@@ -60,6 +61,15 @@ def copy(values: Array, out: Array) -> None:
     """The first len(values) of `out` become `values`; a slice would compile its error message."""
     for i in range(values.size):
         out[i] = values[i]
+
+
+@compiled
+def is_finite(values: Array) -> bool:
+    """Whether every one of some values is finite."""
+    bad = 0
+    for value in values:
+        bad += not math.isfinite(value)  # without a branch, so that it vectorises
+    return bad == 0
 
 
 class CompileNotice(event.Listener):

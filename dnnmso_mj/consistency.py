@@ -138,6 +138,7 @@ def _vectors(scenario: Scenario, n: int) -> Iterator[tuple[str, int, set[int]]]:
     yield from _controller_vectors(scenario, n)
     yield from _numbers("imperfections", scenario.imperfections, n)
     yield from _numbers("imperfections.friction", scenario.imperfections.friction, n)
+    yield from _numbers("safety", scenario.safety, n)
     for k, event in enumerate(scenario.events):
         if event.kind == "push" and event.torque:
             yield f"events.{k}.torque", len(event.torque), {1, n}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,14 +12,16 @@ from typing import NamedTuple
 import numpy as np
 
 from dnnmso_mj.assets import named_files
+from dnnmso_mj.errors import LogError
 from dnnmso_mj.log.format import MODEL
 from dnnmso_mj.log.segments import RESUMED, SEGMENTS, Segment, segments_record
+from dnnmso_mj.logged import LoggedRun
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.recorded import Recorded
 from dnnmso_mj.recorder import Recorder
 from dnnmso_mj.recording import McapRecorder
-from dnnmso_mj.run import LoggedRun, run_to_end
+from dnnmso_mj.run import MAX_NUMBERED, open_first_free, run_to_end
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.simulation import Progress, Simulation
 from dnnmso_mj.trace import Event, RunInfo, StepLayout
@@ -57,17 +60,33 @@ class Continuation:
     model: Model
 
     def record(
-        self, out: Path, where: dict[str, str], force: bool, progress: Progress | None
+        self,
+        outs: Iterable[Path],
+        where: dict[str, str],
+        force: bool,
+        progress: Progress | None,
     ) -> LoggedRun:
-        """Write the whole run; `where` says what it goes on from."""
+        """Write the whole run, to the first of `outs` that is free if there are several.
+
+        `where` says what it goes on from.
+        """
         scenario, ours, theirs = self.last.scenario, self.simulation.layout, self.source.layout
         layout = ours if ours.n_layers >= theirs.n_layers else theirs
         segments, files = self._history()
         records = {RESUMED: where, **({SEGMENTS: segments_record(segments)} if segments else {})}
         scene = Scene(self.simulation.plant.model)
-        with McapRecorder(
-            out, layout, scenario, scene, self.model.text, force=force, records=records, files=files
-        ) as recorder:
+
+        def make(out: Path) -> McapRecorder:
+            text = self.model.text
+            return McapRecorder(
+                out, layout, scenario, scene, text, force=force, records=records, files=files
+            )
+
+        first, *others = itertools.islice(outs, MAX_NUMBERED)
+        recorder = open_first_free((first, *others), make) if others else make(first)
+        if recorder is None:
+            raise LogError(f"{first}: exists, as do all names like it; name another with --out")
+        with recorder:
 
             def run(progress: Progress) -> RunInfo:
                 before = _Widened(recorder, theirs, layout)
@@ -91,12 +110,12 @@ class Continuation:
         segments, files = [], dict(self.model.files)
         for part in self.source.segments:
             if part.first < self.last.first:
-                text = self.source.files[part.model]
-                own = text == self.model.text.encode()
+                text = self.source.model(part.model)
+                own = text == self.model.text
                 name = MODEL if own else f"model-{part.first}.xml"
                 segments.append(replace(part, model=name))
                 if not own:
-                    files |= {name: text, **named_files(text.decode(), self.source.files)}
+                    files |= {name: text.encode(), **named_files(text, self.source.files)}
         return [*segments, replace(self.last, model=MODEL)] if segments else [], files
 
 
@@ -137,6 +156,11 @@ class _Widened:
 
     def __init__(self, recorder: McapRecorder, layout: StepLayout, wider: StepLayout) -> None:
         self._recorder, self._layout, self._wider = recorder, layout, wider
+
+    @property
+    def block(self) -> int:
+        """What the recorder takes at once."""
+        return self._recorder.block
 
     def append(self, rows: Array) -> None:
         if self._layout != self._wider:

@@ -151,12 +151,15 @@ def _column(a: Recorded, b: Recorded, name: str) -> ColumnDifference | None:
         return None
     one, other = (np.asarray(rows, float).reshape(ticks, -1) for rows in (one, other))
 
+    with np.errstate(invalid="ignore", over="ignore"):
+        apart = np.nan_to_num(np.abs(one - other), nan=np.inf)
+
     def place(index: int) -> Place:
         tick, entry = divmod(index, one.shape[1])
         values = float(one[tick, entry]), float(other[tick, entry])
         return Place(tick, float(a.trace["t"][tick]), entry, values)
 
-    size = np.where(differ, np.nan_to_num(np.abs(one - other), nan=np.inf), -1.0)
+    size = np.where(differ, apart, -1.0)
     return ColumnDifference(name, place(int(np.argmax(differ))), place(int(np.argmax(size))))
 
 
@@ -218,12 +221,16 @@ def _arrays(one: Mapping[str, Array], other: Mapping[str, Array]) -> Iterator[st
             yield f"{key} {_alone(key in one)}"
         elif one[key].shape != other[key].shape:
             yield f"{key} of shape {one[key].shape}, and {other[key].shape}"
-        elif one[key].dtype.kind in "SU":
-            if not np.array_equal(one[key], other[key]):
-                yield key
+        elif one[key].dtype != other[key].dtype:
+            yield f"{key} of type {one[key].dtype}, and {other[key].dtype}"
         elif one[key].tobytes() != other[key].tobytes():
-            largest = np.abs(one[key].astype(float) - other[key].astype(float)).max()
-            yield f"{key} by up to {largest:.3g}"
+            numbers = one[key].dtype.kind in "biuf"
+            yield f"{key} by up to {_largest(one[key], other[key]):.3g}" if numbers else key
+
+
+def _largest(one: Array, other: Array) -> float:
+    with np.errstate(invalid="ignore", over="ignore"):
+        return float(np.abs(one.astype(float) - other.astype(float)).max())
 
 
 def _alone(in_first: bool) -> str:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from dnnmso_mj.trace import Trace
+    from dnnmso_mj.logged import LoggedRun
 
 
 class DnnmsoError(Exception):
@@ -30,16 +29,32 @@ class ExternalError(DnnmsoError):
 
 
 class RunInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a logged run; the log is whole and holds the run's first `ticks`: `trace`."""
+    """Ctrl-C during a logged run; the log is whole and holds what was `run`."""
 
-    def __init__(self, log: Path, ticks: int, trace: Trace | None = None) -> None:
-        super().__init__(f"log: {log} ({ticks} ticks)")
-        self.log = log
-        self.ticks = ticks
-        self.trace = trace
+    def __init__(self, run: LoggedRun) -> None:
+        super().__init__(f"log: {run.log} ({run.ticks} ticks)")
+        self.run = run
+        self.log = run.log
+        self.ticks = run.ticks
 
 
-class NonFiniteError(DnnmsoError):
+class UnloggedRunError(LogError):
+    """A run that ended because its log could not be written; `run` holds what the log does."""
+
+    def __init__(self, why: str, run: LoggedRun) -> None:
+        super().__init__(why)
+        self.run = run
+
+
+class EndedEarlyError(DnnmsoError):
+    """What ends a run before its time; the run says so in its status, and its log is whole."""
+
+
+class SafeStopError(EndedEarlyError):
+    """A joint that was past a limit of the scenario: the arm was stopped."""
+
+
+class NonFiniteError(EndedEarlyError):
     """A quantity that left the finite range, or grew past every plausible value, during a run."""
 
     def __init__(self, quantity: str, value: object) -> None:

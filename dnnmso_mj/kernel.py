@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.compiling import compiled, copy, inner, is_finite
 from dnnmso_mj.descent import ADAM, MADAM, SGD, SIGN_SGD, descend
 from dnnmso_mj.network import Activation, Shape
 from dnnmso_mj.scenario import Adam, Rule, Sgd
@@ -45,7 +45,7 @@ class Layer(NamedTuple):
     out: int  # of its outputs and their errors
 
 
-START, END, OUT = (Layer._fields.index(name) for name in ("start", "end", "out"))
+N_OUT, START, END, OUT = (Layer._fields.index(n) for n in ("n_out", "start", "end", "out"))
 
 
 class Net(NamedTuple):
@@ -162,7 +162,7 @@ def forward(net: Net, x: Array) -> Array:
 @compiled
 def propagate(net: Net) -> Array:
     """`forward` once more, with the x it had."""
-    acts, n_layers = net.acts, len(net.layers)
+    acts, n_layers, finite = net.acts, len(net.layers), True
     real = acts.dtype.type
     for layer in range(n_layers):
         n_in, n_out, by_output, stride, start, end, at, out = net.layers[layer]
@@ -173,7 +173,11 @@ def propagate(net: Net) -> Array:
         else:
             _add_rows(W, acts[at : at + n_in + net.bias], acts[out : out + stride])
         if layer < n_layers - 1:
+            # A bounded activation would hide a weight that is infinite.
+            finite = finite and is_finite(acts[out : out + n_out])
             _activate(acts[out : out + n_out], net.activation)
+    if not finite:
+        acts[out] = math.nan
     return acts[out : out + n_out]
 
 
@@ -275,8 +279,12 @@ def _madam_row(
 def learn(net: Net) -> None:
     """Back-propagate and update every weight once, in place, by the network's rule.
 
-    The activations are those of the last `forward`; the output's deltas hold ∂loss/∂f̂.
+    The activations are those of the last `forward`; the output's deltas hold ∂loss/∂f̂. Where that
+    `forward` was not finite nothing is learned: the weights stay as they ended the run.
     """
+    out = output_at(net)
+    if not is_finite(net.acts[out : out + net.layers[-1, N_OUT]]):
+        return
     net.updates[0] += 1
     if net.rule == MADAM:
         _learn_by_madam(net)

@@ -15,6 +15,7 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from dnnmso_mj.errors import ScenarioError
+from dnnmso_mj.files import whole_file
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.loading.shape import ABSENT, Shape
 from dnnmso_mj.paths import scenario_names, scenarios_dir
@@ -68,9 +69,8 @@ def new_scenario(
     scenario = load_scenario(source, controller=controller)
     text = scenario_text(scenario.model_copy(update={"name": name}), file, str(source))
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with file.open("x", encoding="utf-8") as stream:
-            stream.write(text)
+        with whole_file(file, replace=False) as stream:
+            stream.write(text.encode())
     except FileExistsError as error:
         raise ScenarioError(
             f"{clean(str(file))}: exists; allowed: another NAME, another --out, or remove it first"

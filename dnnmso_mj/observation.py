@@ -33,6 +33,8 @@ def torque(action: Array, scale: Array, out: Array) -> None:
     """The torque (n,) N·m of an action (n,), into `out`; what is not finite stays so."""
     np.clip(action, -1.0, 1.0, out=out)
     out *= scale
+    if not np.isfinite(action).all():
+        out[:] = np.where(np.isfinite(action), out, action)
 
 
 def torque_scale(scenario: Scenario, given: tuple[float, ...] | None = None) -> Array:

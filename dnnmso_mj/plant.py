@@ -7,19 +7,20 @@ torques, and is read by joint angle and velocity.
 from __future__ import annotations
 
 import logging
+import math
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
-from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.compiling import compiled, copy, inner, is_finite
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.links import set_links
+from dnnmso_mj.mjcf import gate, read
 from dnnmso_mj.mujoco_calls import (
     mj_comPos,
     mj_Euler,
@@ -48,6 +49,7 @@ INTEGRATORS = {
 WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION
 RK4, EULER = int(INTEGRATORS["rk4"]), int(INTEGRATORS["euler"])
 
+HULL_VERTICES = 64
 TIP = "tip"  # the site at the far end of the last link
 
 LOGGER = logging.getLogger(__name__)
@@ -64,38 +66,33 @@ mujoco.set_mju_user_warning(_tell)
 
 @dataclass(frozen=True)
 class Mjcf:
-    """An MJCF as text without includes, and the folder that its assets are relative to."""
+    """An MJCF as text without includes, and the folder that its assets are relative to.
+
+    There is none that `dnnmso_mj.mjcf.gate` has not let in.
+
+    Raises:
+        ScenarioError: the gate refuses it.
+    """
 
     text: str
     folder: str = ""
+
+    def __post_init__(self) -> None:
+        gate(self.text, self.folder)
 
     @classmethod
     def read(cls, path: Path) -> Mjcf:
         """Read the file at `path`, its includes put in their places.
 
         Raises:
-            ScenarioError: a file cannot be read, or one with includes is not XML.
+            ScenarioError: it cannot be read, or the gate refuses it.
         """
-        try:
-            text = path.read_text(encoding="utf-8")
-            if "<include" in text:
-                root = ElementTree.fromstring(text)  # noqa: S314
-                _put_in_includes(root, path.parent)
-                text = ElementTree.tostring(root, encoding="unicode")
-        except (OSError, UnicodeDecodeError, ElementTree.ParseError, RecursionError) as error:
-            raise ScenarioError(f"plant.model: cannot read {path}: {error}") from error
-        return cls(text, str(path.parent))
+        return cls(read(path), str(path.parent))
 
-
-def _put_in_includes(element: ElementTree.Element, folder: Path) -> None:
-    """Replace each <include file="…"/> by what stands in that file; paths are from `folder`."""
-    for place, child in reversed(list(enumerate(element))):
-        if child.tag == "include":
-            part = ElementTree.parse(folder / child.get("file", "")).getroot()  # noqa: S314
-            _put_in_includes(part, folder)
-            element[place : place + 1] = list(part)
-        else:
-            _put_in_includes(child, folder)
+    @property
+    def checked(self) -> str:
+        """What MuJoCo is given: the text as the gate understood it."""
+        return gate(self.text, self.folder)
 
 
 def build_spec(plant: PlantSpec, dt: float, mjcf: Mjcf) -> mujoco.MjSpec:
@@ -106,7 +103,7 @@ def build_spec(plant: PlantSpec, dt: float, mjcf: Mjcf) -> mujoco.MjSpec:
             that masses and lengths are set on.
     """
     try:
-        spec = mujoco.MjSpec.from_string(mjcf.text)
+        spec = mujoco.MjSpec.from_string(mjcf.checked)
     except ValueError as error:
         raise ScenarioError(f"plant.model = {plant.model}: MuJoCo says: {error}") from error
     spec.modelfiledir = mjcf.folder
@@ -115,6 +112,9 @@ def build_spec(plant: PlantSpec, dt: float, mjcf: Mjcf) -> mujoco.MjSpec:
     spec.option.integrator = INTEGRATORS[plant.integrator]
     # Without this MuJoCo answers a NaN by moving the arm back to its start, silently.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    for mesh in spec.meshes:  # hulls are for contacts, which no plant has, and slow to make
+        if mesh.inertia != mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX:
+            mesh.maxhullvert = HULL_VERTICES
     if plant.masses is not None and plant.lengths is not None:
         set_links(spec, plant.links, plant.masses, plant.lengths)
         if spec.site(TIP) is None:
@@ -348,7 +348,10 @@ class NominalModel:
 
 @inner
 def inertia(nominal: Nominal, q: Array) -> None:
-    """M(q) into `nominal.M`."""
+    """M(q) into `nominal.M`; of a q that is not finite, which MuJoCo never sees, no number is."""
+    if not is_finite(q):
+        nominal.M.fill(math.nan)
+        return
     copy(q, nominal.q)
     mj_kinematics(nominal.model, nominal.data)
     mj_comPos(nominal.model, nominal.data)
@@ -358,7 +361,10 @@ def inertia(nominal: Nominal, q: Array) -> None:
 
 @compiled
 def bias(nominal: Nominal, q: Array, qd: Array) -> None:
-    """V(q, q̇) + G(q) into `nominal.bias`."""
+    """V(q, q̇) + G(q) into `nominal.bias`; as `inertia`."""
+    if not (is_finite(q) and is_finite(qd)):
+        nominal.bias.fill(math.nan)
+        return
     copy(q, nominal.q)
     copy(qd, nominal.qd)
     mj_fwdPosition(nominal.model, nominal.data)

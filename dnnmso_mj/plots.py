@@ -110,8 +110,11 @@ def _no_collection() -> Iterator[None]:
 
 
 def _title(trace: Trace) -> str:
-    """Scenario and seed, and what became of the run if it did not end well."""
+    """Scenario and seed, what is left out, and what became of a run that did not end well."""
     title = f"{trace.scenario.name}, seed {trace.info.seed}"
+    ticks = round((trace["t"][-1] - trace["t"][0]) / trace.scenario.dt) + 1
+    if ticks > len(trace):
+        title += f", outlined by {len(trace)} of {ticks} ticks"
     if trace.info.status == "ok":
         return title
     return f"{title}: {trace.info.status} at t = {trace['t'][-1]:g} s"

@@ -10,9 +10,11 @@ import numpy as np
 from mcap.records import Attachment
 
 from dnnmso_mj.errors import LogError
-from dnnmso_mj.log.format import create, snapshot_arrays, snapshot_place, unwritable
+from dnnmso_mj.log.format import snapshot_place, unwritable
+from dnnmso_mj.log.npz import read_npz
+from dnnmso_mj.log.place import Place
 from dnnmso_mj.log.prefix import Prefix, copy
-from dnnmso_mj.log.scan import Steps, scan
+from dnnmso_mj.log.scan import scan, scan_trace
 from dnnmso_mj.log.segments import RESUMED
 from dnnmso_mj.log.writer import LogWriter
 from dnnmso_mj.paths import find_log
@@ -62,12 +64,7 @@ def read_trace(path: str | Path) -> Trace:
     Raises:
         LogError: the file is no log of this package, or holds not one tick.
     """
-    steps = Steps()
-    log = scan(find_log(path), steps.add)
-    columns = steps.columns()
-    if columns is None:
-        raise log.error("holds no tick: the run ended before its first. Run it again")
-    return Trace(columns, log.scenario(), log.run(), tuple(log.events))
+    return scan_trace(find_log(path))[1]
 
 
 def log_info(path: str | Path) -> LogInfo:
@@ -110,7 +107,7 @@ def read_snapshots(path: str | Path) -> list[Snapshot]:
         if not isinstance(record, Attachment) or not (place := snapshot_place(record.name)):
             continue
         try:
-            snapshots.append(Snapshot(*place, snapshot_arrays(record.data)))
+            snapshots.append(Snapshot(*place, read_npz(record.data)))
         except ValueError as error:
             raise LogError(f"{path}: the attachment {record.name} is {error}") from error
     return snapshots
@@ -123,16 +120,19 @@ def recover(path: str | Path, out: str | Path) -> LogInfo:
         LogError: `path` is no log, or `out` exists or cannot be written; nothing is left behind.
     """
     torn, target = log_info(path), Path(out)
-    file = create(target)
     try:
-        with file:
-            writer = LogWriter(file)
+        place = Place(target)
+        try:
+            writer = LogWriter(place.file)
             # Without its record "run" a log is unfinished, as what was torn must stay.
-            copy(Prefix(torn.path), writer, leave_out=None if torn.complete else "run")
+            prefix = Prefix(torn.path)
+            copy(prefix, writer, leave_out=None if torn.complete else "run")
+            if prefix.complete != torn.complete:
+                raise LogError(f"{torn.path} was changed while it was read. Recover it again")
             writer.finish()
-    except BaseException as error:
-        target.unlink()
-        if isinstance(error, OSError):
-            raise unwritable(target, error) from error
-        raise
+            place.take()
+        finally:
+            place.give_up()
+    except OSError as error:
+        raise unwritable(target, error) from error
     return log_info(target)

@@ -55,6 +55,11 @@ def state_at(source: Recorded, segment: Segment, mjcf: Mjcf, tick: int) -> Found
     if tick == 0:
         return Found(None, 0, [])
     simulation = Simulation(segment.scenario, mjcf)
+    if simulation.layout.n_layers > source.layout.n_layers:
+        raise LogError(
+            f"{source.path}: has {source.layout.n_layers} layers of a network; its scenario "
+            f"{simulation.layout.n_layers}. {_versions(source)}"
+        )
     start = _nearest(source, segment, tick)
     state = _snapshot(source, simulation, start) if start else None
     if state is not None and start == tick:

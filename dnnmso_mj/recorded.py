@@ -10,11 +10,12 @@ import numpy as np
 from mcap.records import Attachment
 
 from dnnmso_mj.errors import LogError
-from dnnmso_mj.log.format import snapshot_arrays, snapshot_place
-from dnnmso_mj.log.prefix import Prefix
-from dnnmso_mj.log.scan import Steps, scan
+from dnnmso_mj.log.format import MODEL, snapshot_place
+from dnnmso_mj.log.npz import read_npz
+from dnnmso_mj.log.scan import scan_trace
 from dnnmso_mj.log.segments import Segment, read_segments
 from dnnmso_mj.trace import StepLayout, Trace
+from dnnmso_mj.wording import clean
 
 Array = np.ndarray
 
@@ -46,10 +47,23 @@ class Recorded:
             LogError: it is damaged.
         """
         try:
-            return snapshot_arrays(self.snapshots[tick, name])
+            return read_npz(self.snapshots[tick, name])
         except ValueError as error:
             t = tick * self.trace.scenario.dt
             raise LogError(f"{self.path}: the snapshot {name} of {t:g} s is {error}") from error
+
+    def model(self, name: str = MODEL) -> str:
+        """The MJCF in an attachment.
+
+        Raises:
+            LogError: there is none, or it is no text.
+        """
+        try:
+            return self.files[name].decode()
+        except KeyError:
+            raise LogError(f"{self.path}: has no attachment {clean(name)}. Run it again") from None
+        except UnicodeDecodeError as error:
+            raise LogError(f"{self.path}: its attachment {clean(name)} is no UTF-8") from error
 
     def segment(self, tick: int) -> Segment:
         """The one that a tick belongs to."""
@@ -62,24 +76,22 @@ def read_recorded(path: Path) -> Recorded:
     Raises:
         LogError: the file is no log of this package, or holds not one tick.
     """
-    steps = Steps()
-    log = scan(path, steps.add)
-    columns = steps.columns()
-    if columns is None:
-        raise log.error("holds no tick: the run ended before its first. Run it again")
-    trace = Trace(columns, log.scenario(), log.run(), tuple(log.events))
-    try:
-        segments = read_segments(log.metadata, trace.scenario)
-    except ValueError as error:
-        raise log.error(f"{error}. Read it with the version that wrote it") from error
-    snapshots, files = {}, {}
-    for record in Prefix(path):
-        if not isinstance(record, Attachment):
-            continue
+    snapshots: dict[tuple[str, float], bytes] = {}
+    files: dict[str, bytes] = {}
+
+    def keep(record: Attachment) -> None:
         place = snapshot_place(record.name)
         if place is None:
             files[record.name] = record.data
         else:
-            snapshots[round(place[1] / trace.scenario.dt), place[0]] = record.data
+            snapshots[place] = record.data
+
+    log, trace = scan_trace(path, keep)
+    try:
+        segments = read_segments(log.metadata, trace.scenario)
+    except ValueError as error:
+        raise log.error(f"{error}. Read it with the version that wrote it") from error
     layout = StepLayout(trace.n_joints, trace.n_layers)
-    return Recorded(path, trace, layout, snapshots, files, tuple(segments))
+    dt = trace.scenario.dt
+    by_tick = {(round(t / dt), name): data for (name, t), data in snapshots.items()}
+    return Recorded(path, trace, layout, by_tick, files, tuple(segments))

@@ -15,8 +15,8 @@ Array = np.ndarray
 class Recorder(Protocol):
     """Where the rows of a run go.
 
-    One with an attribute `block` takes that many at once; one whose `keeps_snapshots` is False is
-    given none.
+    One with an attribute `block`, which may change, takes that many at once; one whose
+    `keeps_snapshots` is False is given none.
     """
 
     def append(self, rows: Array) -> None:

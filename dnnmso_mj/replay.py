@@ -14,13 +14,14 @@ from pathlib import Path
 from dnnmso_mj.assets import put_back
 from dnnmso_mj.errors import DnnmsoError, LogError, ScenarioError
 from dnnmso_mj.extras import require
-from dnnmso_mj.log.format import MODEL, unwritable
+from dnnmso_mj.log.format import unwritable
 from dnnmso_mj.plant import build_spec, compile_spec
 from dnnmso_mj.reading import Snapshot
 from dnnmso_mj.recorded import Recorded, read_recorded
 from dnnmso_mj.scene import Scene
 from dnnmso_mj.viewer.plot import TIMELINE
 from dnnmso_mj.viewer.process import (
+    LOCAL,
     check_display,
     free_port,
     headless_viewer,
@@ -29,7 +30,7 @@ from dnnmso_mj.viewer.process import (
     until_interrupted,
 )
 from dnnmso_mj.viewer.summary import drawable
-from dnnmso_mj.viewer.web import web_server
+from dnnmso_mj.viewer.web import check_bind, web_server
 
 Logs = Path | Sequence[Path]
 
@@ -78,25 +79,35 @@ def open_viewer(logs: Logs, first_tab: str = "Tracking", *, side_by_side: bool =
 
 
 def serve(
-    logs: Logs, port: int = 9090, first_tab: str = "Tracking", *, side_by_side: bool = False
+    logs: Logs,
+    port: int = 9090,
+    first_tab: str = "Tracking",
+    *,
+    side_by_side: bool = False,
+    bind: str = LOCAL,
 ) -> None:
-    """Show logs to browsers on this machine, and to no others, until Ctrl-C.
+    """Show logs to browsers until Ctrl-C, unless told otherwise to those on this machine alone.
 
     Args:
         logs: MCAP logs.
         port: of the web page, whose address is printed on standard output.
         first_tab, side_by_side: as in `save_rrd`.
+        bind: the IP address to listen on; who reaches it beside this machine is said on standard
+            error.
 
     Raises:
         DnnmsoError: the port is taken, or the server cannot start.
         LogError, MissingExtraError: as `save_rrd`.
     """
+    check_bind(bind)
     with (
         until_interrupted(),
         _converted(logs, first_tab, side_by_side) as (rrd, _),
-        web_server(port, str(rrd)) as server,
+        web_server(port, str(rrd), bind=bind) as server,
     ):
         print(server.page, flush=True)
+        if server.exposed:
+            print(server.exposed, file=sys.stderr)
         print("Ctrl-C ends it.", file=sys.stderr)
         server.process.wait()
 
@@ -183,16 +194,14 @@ def run_names(logs: Sequence[Path]) -> list[str]:
 
 def _scene(log: Recorded) -> Scene:
     """The robot of a log, from the model that it holds and its scenario's masses and lengths."""
-    data = log.files.get(MODEL)
-    if data is None:
-        raise LogError(f"{log.path}: no attachment {MODEL!r} to draw the robot from. Run it again.")
+    text = log.model()
     scenario = log.trace.scenario
     try:
         with tempfile.TemporaryDirectory() as folder:
-            mjcf = put_back(data.decode(), log.files, Path(folder))
+            mjcf = put_back(text, log.files, Path(folder))
             spec = build_spec(scenario.plant, scenario.dt, mjcf)
             return Scene(compile_spec(spec, scenario.plant.model))
-    except (ScenarioError, UnicodeDecodeError) as error:
+    except ScenarioError as error:
         raise LogError(f"{log.path}: its robot cannot be drawn: {error}") from error
 
 

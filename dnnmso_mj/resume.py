@@ -6,10 +6,9 @@ way, so that nothing goes on from a state that the log's run was never in.
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,11 +20,12 @@ from dnnmso_mj.errors import LogError, ScenarioError
 from dnnmso_mj.loading.changing import MODEL, change_scenario
 from dnnmso_mj.loading.overrides import parse_overrides
 from dnnmso_mj.log.segments import Segment
+from dnnmso_mj.logged import LoggedRun
 from dnnmso_mj.paths import find_model
 from dnnmso_mj.plant import Mjcf
 from dnnmso_mj.recomputing import state_at
 from dnnmso_mj.recorded import Recorded, read_recorded
-from dnnmso_mj.run import LoggedRun
+from dnnmso_mj.run import MAX_NUMBERED
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.simulation import Progress, Simulation
 
@@ -73,6 +73,7 @@ def resume(
         LogError: the log cannot be read, does not reach to `at`, or is not computed again as it
             was; or `out` exists or cannot be written.
         ScenarioError: the changed scenario cannot be run, or not from there.
+        UnloggedRunError: the new log could not be written on; it holds the run until then.
         RunInterrupted: Ctrl-C; the new log is whole, with the metrics of what was run.
     """
     source = read_recorded(log)
@@ -87,7 +88,8 @@ def resume(
     with TemporaryDirectory(prefix="dnnmso-") as folder:
         rest, checked = _prepare(source, tick, scenario, sets, Path(folder))
         where = {"source": log.name, "at": repr(at), "sets": json.dumps(list(sets))}
-        done = rest.record(out or _free_name(log, tick * scenario.dt), where, force, progress)
+        outs = _names(log, tick * scenario.dt) if out is None else [out]
+        done = rest.record(outs, where, force and out is not None, progress)
     return Resumed(done, tick, checked, rest.last.told if rest.last.first == tick else "")
 
 
@@ -128,10 +130,7 @@ def _tick(source: Recorded, at: float) -> int:
 
 def _model(source: Recorded, segment: Segment, folder: Path) -> Model:
     """The model of a segment, from the log alone; its meshes go to a folder."""
-    data = source.files.get(segment.model)
-    if data is None:
-        raise LogError(f"{source.path}: has no attachment {segment.model}; it cannot be resumed")
-    text = data.decode()
+    text = source.model(segment.model)
     files = named_files(text, source.files)
     return Model(put_back(text, files, folder), text, files)
 
@@ -141,8 +140,8 @@ def _model_file(name: str) -> Model:
     return Model(mjcf, mjcf.text, read_assets(mjcf))
 
 
-def _free_name(log: Path, at: float) -> Path:
-    """LOG-from-AT.mcap, or LOG-from-AT-2.mcap …"""
+def _names(log: Path, at: float) -> Iterator[Path]:
+    """LOG-from-AT.mcap, LOG-from-AT-2.mcap …"""
     stem = f"{log.stem}-from-{at:g}"
-    names = (f"{stem}{f'-{k}' if k > 1 else ''}.mcap" for k in itertools.count(1))
-    return next(path for path in map(log.with_name, names) if not path.exists())
+    numbers = ("", *(f"-{k}" for k in range(2, MAX_NUMBERED)))
+    return (log.with_name(f"{stem}{number}.mcap") for number in numbers)

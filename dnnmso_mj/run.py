@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from dnnmso_mj.assets import read_assets
-from dnnmso_mj.errors import LogError, RunInterrupted
+from dnnmso_mj.errors import LogError, RunInterrupted, UnloggedRunError
 from dnnmso_mj.interrupts import interrupted_once, raise_lost
-from dnnmso_mj.metrics import compute_metrics
+from dnnmso_mj.logged import LoggedRun, judge
 from dnnmso_mj.paths import find_model, logs_dir
 from dnnmso_mj.plant import Mjcf
-from dnnmso_mj.reading import read_trace
+from dnnmso_mj.reading import log_info
 from dnnmso_mj.realtime import left_in_peace, real_time_pace
 from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.scenario import Scenario
@@ -25,20 +24,12 @@ from dnnmso_mj.scene import Scene
 from dnnmso_mj.simulation import Progress, Simulation
 from dnnmso_mj.stage import AS_FAST_AS_CAN_BE
 from dnnmso_mj.tee import Tee
-from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
+from dnnmso_mj.trace import Event, RunInfo, StepLayout
 
 if TYPE_CHECKING:
     from dnnmso_mj.viewer.live import LiveView
 
 MAX_NUMBERED = 10_000
-
-
-@dataclass(frozen=True)
-class LoggedRun:
-    """A finished run: its columns, and the log they were read back from."""
-
-    trace: Trace
-    log: Path
 
 
 def run_logged(
@@ -67,6 +58,7 @@ def run_logged(
         ScenarioError: the model cannot be used; no log is left behind.
         LogError: the log exists or cannot be written.
         DnnmsoError: the live view cannot start; no log is left behind.
+        UnloggedRunError: the log could not be written on; it holds the run until then.
         RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run. Another Ctrl-C
             while the log is being ended does nothing.
     """
@@ -76,7 +68,7 @@ def run_logged(
     scene = Scene(simulation.plant.model)
     if live is not None:
         live.begin(scenario, scene, simulation.layout)
-    with _open_log(simulation, scene, mjcf, out, force) as recorder:
+    with _open_log(simulation, scene, mjcf, out, force, real_time) as recorder:
         sink = recorder if live is None else Tee(recorder, live)
 
         def run(progress: Progress) -> RunInfo:
@@ -107,6 +99,7 @@ def run_to_end(
         live: the view, which the run fills too.
 
     Raises:
+        UnloggedRunError: the log could not be written on; it holds the run until then.
         RunInterrupted: Ctrl-C; the log is whole, with the metrics of what was run. Another Ctrl-C
             while the log is being ended does nothing.
     """
@@ -124,10 +117,17 @@ def run_to_end(
             end()
             wall = time.perf_counter() - started
             info = RunInfo("interrupted", scenario.seed, wall, reason="Ctrl-C")
-            trace = _finish(recorder, scenario, layout, info, live)
-            raise RunInterrupted(recorder.path, len(trace), trace) from stop
+            raise RunInterrupted(_finish(recorder, scenario, layout, info, live)) from stop
+        except LogError as error:
+            if not recorder.broken:
+                raise
+            end()
+            wall = time.perf_counter() - started
+            info = RunInfo("failed", scenario.seed, wall, reason=str(error))
+            run_so_far = judge(recorder.path, scenario, layout, info, *_readable(recorder))
+            raise UnloggedRunError(str(error), run_so_far) from error
         end()
-        return LoggedRun(_finish(recorder, scenario, layout, info, live), recorder.path)
+        return _finish(recorder, scenario, layout, info, live)
 
 
 def _finish(
@@ -136,44 +136,76 @@ def _finish(
     layout: StepLayout,
     info: RunInfo,
     live: LiveView | None,
-) -> Trace:
+) -> LoggedRun:
     """Compute the metrics of what the log holds, and end log and view with them."""
-    recorder.flush()
-    if recorder.ticks:
-        trace = read_trace(recorder.path)
-    else:  # ended before its first row
-        empty = np.empty((0, layout.width))
-        trace = Trace(layout.columns(empty), scenario, info)
-    written: dict[str, Any] = {
-        "versions": trace.info.versions,
-        "git_commit": trace.info.git_commit,
-    }
-    trace = replace(trace, info=replace(info, **written))
-    info = replace(trace.info, metrics=compute_metrics(trace))
-    recorder.finish(info)
+    done: LoggedRun | None = None
+    try:
+        recorder.flush()
+        done = judge(recorder.path, scenario, layout, info, recorder.ticks, recorder.readable)
+        recorder.finish(done.info)
+    except LogError as error:
+        if not recorder.broken:
+            raise
+        if done is None:
+            done = judge(recorder.path, scenario, layout, info, *_readable(recorder))
+        failed = replace(done.info, status="failed", reason=str(error))
+        raise UnloggedRunError(str(error), replace(done, info=failed)) from error
     if live is not None:
-        live.end(info)
-    return replace(trace, info=info)
+        live.end(done.info)
+    return done
+
+
+def _readable(recorder: McapRecorder) -> tuple[int, Path]:
+    """How many ticks of a log that could not be written can be read, and where."""
+    try:
+        return log_info(recorder.readable).ticks, recorder.readable
+    except LogError:
+        return 0, recorder.path
+
+
+def open_first_free(
+    names: Iterable[Path], make: Callable[[Path], McapRecorder]
+) -> McapRecorder | None:
+    """A log of the first name that nobody has, nor takes meanwhile; None: there is none."""
+    for path in names:
+        if os.path.lexists(path):
+            continue
+        try:
+            return make(path)
+        except LogError:
+            if not os.path.lexists(path):
+                raise
+    return None
 
 
 def _open_log(
-    simulation: Simulation, scene: Scene, mjcf: Mjcf, out: Path | None, force: bool
+    simulation: Simulation,
+    scene: Scene,
+    mjcf: Mjcf,
+    out: Path | None,
+    force: bool,
+    real_time: bool,
 ) -> McapRecorder:
     scenario, files = simulation.scenario, read_assets(mjcf)
-    if out is not None:
+
+    def make(path: Path) -> McapRecorder:
         return McapRecorder(
-            out, simulation.layout, scenario, scene, mjcf.text, force=force, files=files
+            path,
+            simulation.layout,
+            scenario,
+            scene,
+            mjcf.text,
+            force=force and out is not None,
+            real_time=real_time,
+            files=files,
         )
-    for number in range(1, MAX_NUMBERED):
-        suffix = f"-{number}" if number > 1 else ""
-        path = logs_dir() / f"{scenario.name}{suffix}.mcap"
-        if path.exists():
-            continue
-        try:
-            return McapRecorder(path, simulation.layout, scenario, scene, mjcf.text, files=files)
-        except LogError:
-            if not path.exists():
-                raise
+
+    if out is not None:
+        return make(out)
+    suffixes = ("", *(f"-{number}" for number in range(2, MAX_NUMBERED)))
+    names = (logs_dir() / f"{scenario.name}{suffix}.mcap" for suffix in suffixes)
+    if (recorder := open_first_free(names, make)) is not None:
+        return recorder
     raise LogError(
         f"{logs_dir()} holds {MAX_NUMBERED - 1} logs of {scenario.name}; "
         "name one with --out, or clear the folder"

@@ -88,13 +88,30 @@ class Scene:
     Args:
         model: any compiled model whose joints are all hinges and slides.
 
+    Attributes:
+        links, geoms: its parts.
+        tip_place: the link that the tip is on, and where in that link's frame (3,) m.
+
     Raises:
         ScenarioError: a joint is free or a ball.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self.links: tuple[Link, ...] = tuple(_links(model))
-        self.geoms: tuple[Geom, ...] = tuple(_geoms(model))
+        self._gather(tuple(_links(model)), tuple(_geoms(model)), _tip_place(model))
+
+    @classmethod
+    def of(
+        cls, links: tuple[Link, ...], geoms: tuple[Geom, ...], tip_place: tuple[str, Array]
+    ) -> Scene:
+        """A scene of the parts of another: its `links`, `geoms` and `tip_place`."""
+        scene = cls.__new__(cls)
+        scene._gather(links, geoms, tip_place)
+        return scene
+
+    def _gather(
+        self, links: tuple[Link, ...], geoms: tuple[Geom, ...], tip_place: tuple[str, Array]
+    ) -> None:
+        self.links, self.geoms, self.tip_place = links, geoms, tip_place
         joints = [link.joint for link in self.links]
         self._xyz = np.array([link.xyz for link in self.links]).reshape(-1, 3)
         self._quat = np.array([link.quat_xyzw for link in self.links]).reshape(-1, 4)
@@ -105,7 +122,7 @@ class Scene:
         self._half = 0.5 * turns[:, 0]
         self._turn = multiply(self._quat, np.pad(turns * axis, ((0, 0), (0, 1))))
         self._slide = rotate(self._quat, ~turns * axis)
-        self._tip_chain, self._tip_offset = self._find_tip(model)
+        self._tip_chain = list(self._chain(tip_place[0]))
 
     def transforms(self, q: Array) -> Array:
         """Each link in its parent's frame, in the order of `links`.
@@ -126,7 +143,7 @@ class Scene:
     def tip(self, q: Array) -> Array:
         """World position (m) of the site named "tip", or of the last body: (..., n) -> (..., 3)."""
         poses = self.transforms(q)
-        point = np.broadcast_to(self._tip_offset, (*poses.shape[:-2], 3))
+        point = np.broadcast_to(self.tip_place[1], (*poses.shape[:-2], 3))
         for k in self._tip_chain:
             point = poses[..., k, :3] + rotate(poses[..., k, 3:], point)
         return point
@@ -145,17 +162,19 @@ class Scene:
         """
         return urdf_text(self.links, self.geoms)
 
-    def _find_tip(self, model: mujoco.MjModel) -> tuple[list[int], Array]:
-        """The links from the tip's up to the root, and the tip in the first one's frame."""
-        site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "tip")
-        body = model.nbody - 1 if site < 0 else model.site_bodyid[site]
-        offset = np.zeros(3) if site < 0 else np.array(model.site_pos[site])
+    def _chain(self, name: str) -> Iterator[int]:
+        """The places of the links from a link up to the root."""
         places = {link.name: k for k, link in enumerate(self.links)}
-        chain, name = [], _body_name(model, body)
         while name != WORLD:
-            chain.append(places[name])
+            yield places[name]
             name = self.links[places[name]].parent
-        return chain, offset
+
+
+def _tip_place(model: mujoco.MjModel) -> tuple[str, Array]:
+    """The link that the tip is on, and where in that link's frame (m)."""
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, "tip")
+    body = model.nbody - 1 if site < 0 else model.site_bodyid[site]
+    return _body_name(model, body), np.zeros(3) if site < 0 else np.array(model.site_pos[site])
 
 
 def _links(model: mujoco.MjModel) -> Iterator[Link]:

@@ -7,7 +7,7 @@ other has its `update` called tick by tick between the same two compiled halves.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numba.core import event
@@ -16,11 +16,11 @@ from dnnmso_mj.compile_loop import compile_elsewhere, compile_halves_elsewhere
 from dnnmso_mj.compiling import CompileNotice
 from dnnmso_mj.controllers import Controller, build_controller, compiled_ticks, no_command
 from dnnmso_mj.divergence import not_finite
-from dnnmso_mj.errors import NonFiniteError
+from dnnmso_mj.errors import EndedEarlyError, NonFiniteError
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK, MemoryRecorder
 from dnnmso_mj.plant import Mjcf, Plant
 from dnnmso_mj.recorder import Recorder
-from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.scenario import External, Policy, Scenario
 from dnnmso_mj.stage import AS_FAST_AS_CAN_BE, Stage
 from dnnmso_mj.tick import RUNNING, START_NS, STATUS, TOOK_NS, Pace, begin_tick, end_tick
 from dnnmso_mj.trace import Event, RunInfo, StepLayout, Trace
@@ -82,19 +82,18 @@ class Simulation:
             until: the tick to stop before, instead of at the scenario's end.
 
         Returns:
-            Status "ok" or "diverged" (with the reason), the seed and the wall time of the loop.
+            Status "ok" or "diverged" (with the reason; a safe stop's begins with "safe stop"), the
+            seed and the wall time of the loop.
         """
         status, reason = "ok", ""
         self.begin(start)
         started = time.perf_counter()
         try:
             self._loop(recorder, progress, self.scenario.n_ticks if until is None else until)
-        except NonFiniteError as error:
+        except EndedEarlyError as error:
             t = self.stage.tick * self.scenario.dt
             state = self.controller.state()
-            causes = not_finite(state)
-            cause = f" with {', '.join(causes)} not finite" if causes else ""
-            status, reason = "diverged", f"{error}{cause} at t = {t:.6g} s"
+            status, reason = "diverged", f"{error}{_causes(error, state)} at t = {t:.6g} s"
             recorder.event(Event(t, "error", f"diverged: {reason}"))
             recorder.snapshot("controller", t, state)
         wall = time.perf_counter() - started
@@ -151,19 +150,40 @@ class Simulation:
         self.controller.reset(self.stage.reading())
 
     def _loop(self, recorder: Recorder, progress: Progress | None, n_ticks: int) -> None:
+        """Ticks up to `n_ticks`.
+
+        Raises:
+            EndedEarlyError: the run ends before them; rows of before are recorded.
+        """
         stage, snapshot_every = self.stage, self.snapshot_every
-        most = min(getattr(recorder, "block", BLOCK), LARGEST_BLOCK)
         stage.world.counts[START_NS] = time.monotonic_ns() + HEAD_START_NS
         while stage.tick < n_ticks:
             first = stage.tick
             if first % snapshot_every == 0:
+                self._check_controller()
                 self._give_state(recorder)
+            most = min(getattr(recorder, "block", BLOCK), LARGEST_BLOCK)
             end = min(stage.open_block(recorder, most), n_ticks)
             count = min(end, (first // snapshot_every + 1) * snapshot_every) - first
             self._run_block(first, count, recorder)
             if progress is not None:
                 progress(count)
+        stage.check_end()
+        self._check_controller()
         self._give_state(recorder)
+
+    def _check_controller(self) -> None:
+        """Look at all that the controller keeps, which may not show in its torque.
+
+        Raises:
+            NonFiniteError: something is not finite; what code from outside keeps is its own affair.
+        """
+        if self._given or isinstance(self.scenario.controller, External | Policy):
+            return
+        for name in not_finite(state := self.controller.state()):
+            values = state[name].ravel()
+            at = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise NonFiniteError(name, f"{values[at]} at entry {at}")
 
     def _give_state(self, recorder: Recorder) -> None:
         """A snapshot of the present state, for a recorder that keeps it."""
@@ -177,7 +197,7 @@ class Simulation:
         """Ticks first to first + count, and their rows to the recorder.
 
         Raises:
-            NonFiniteError: the run must end; rows before it are recorded.
+            EndedEarlyError: the run must end; rows before it are recorded.
         """
         stage = self.stage
         try:
@@ -197,8 +217,16 @@ class Simulation:
                 began = time.perf_counter_ns()
                 self._command = self.controller.update(world.inputs)
                 world.counts[TOOK_NS] = time.perf_counter_ns() - began
-            if stage.act(k, self._command):
+            if stage.ended or stage.act(k, self._command):
                 return
+
+
+def _causes(error: EndedEarlyError, state: Mapping[str, Array]) -> str:
+    """What else is not finite, in words."""
+    if not isinstance(error, NonFiniteError):
+        return ""
+    names = [name for name in not_finite(state) if name != error.quantity]
+    return f" with {', '.join(names)} not finite" if names else ""
 
 
 def simulate(scenario: Scenario, mjcf: Mjcf | None = None, *, watch: bool = True) -> Trace:

@@ -6,14 +6,14 @@ interpreter is done here, between two blocks of ticks.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from dnnmso_mj.changes import Changes
 from dnnmso_mj.controllers import LEARNING, Command
 from dnnmso_mj.divergence import why_it_ended
-from dnnmso_mj.errors import NonFiniteError
+from dnnmso_mj.errors import EndedEarlyError, NonFiniteError, SafeStopError
 from dnnmso_mj.external.imperfection import Hooks
 from dnnmso_mj.imperfections.actuators import start_actuators
 from dnnmso_mj.imperfections.loads import start_loads
@@ -23,14 +23,16 @@ from dnnmso_mj.memory_recorder import LARGEST_BLOCK
 from dnnmso_mj.plant import Mjcf, NominalModel, Plant
 from dnnmso_mj.recorder import Recorder
 from dnnmso_mj.reference import Reference
+from dnnmso_mj.safety import start_safety, what_tripped
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.scenario.controller import lookahead
 from dnnmso_mj.theory import start_bounds
 from dnnmso_mj.tick import (
     CHUNK_START,
-    OUT_OF_RANGE,
+    RECORDED,
     ROWS,
     RUNNING,
+    SAFELY_STOPPED,
     STATUS,
     Pace,
     begin_tick,
@@ -111,6 +113,7 @@ class Stage:
         self.plant.reset(x[:n], x[n:])
         start_actuators(world.actuators)
         start_loads(world.loads)
+        start_safety(world.safety)
         self._sensors.start(x)
         q_ref, qd_ref, _ = self.reference.sample(np.zeros(1))
         start_bounds(world.bounds, x - np.concatenate([q_ref[0], qd_ref[0]]))
@@ -120,7 +123,8 @@ class Stage:
         world.counts[:] = 0
         self._begin_chunk(0)
         self.hooks.start()
-        self._changes = Changes(self.layout)
+        self._changes = Changes(self.layout, scenario.imperfections.torque_limit)
+        self._stop_told = False
 
     def go_on(self, tick: int, state: Mapping[str, Array]) -> None:
         """From the start to what `state` gave before a tick of this scenario.
@@ -138,6 +142,7 @@ class Stage:
         # What pushed in the period before is still to be accounted for.
         self.world = self.world._replace(loads=self.world.loads._replace(acting=True))
         self._changes.flags[:] = state["flags"]
+        self._stop_told = bool(self.world.safety.ticks[0])
 
     def state(self) -> dict[str, Array]:
         """What the next tick depends on, copied; see `world_state.capture`."""
@@ -179,23 +184,34 @@ class Stage:
         self.tick += len(rows)
         if len(rows):
             recorder.append(rows)
-            for change in self._changes.events(rows):
-                recorder.event(change)
+            for happened in sorted(self._told(rows), key=lambda event: event.t):
+                recorder.event(happened)
+
+    @property
+    def ended(self) -> bool:
+        """Whether a tick of this block ends the run."""
+        return bool(self.world.counts[STATUS] != RUNNING)
 
     def sense(self, k: int) -> bool:
-        """Begin tick k: what the controller is told of it; whether it has time to answer."""
+        """Begin tick k: what the controller is told of it; whether it has time to answer.
+
+        A state or a reading that is not finite ends the run here: see `ended`.
+        """
         in_time = bool(begin_tick(self.world, k))
-        self.hooks.sense(k * self.world.dt, self.world.inputs.x)
+        if not self.ended:
+            self.hooks.sense(k * self.world.dt, self.world.inputs.x)
         return in_time
 
     def act(self, k: int, command: Command) -> bool:
         """End tick k with a command, and step the arm; whether the run must end: see `divergence`.
 
         Raises:
-            NonFiniteError: code from outside makes a torque that is not finite.
+            NonFiniteError: code from outside makes a torque that is not finite, or is given one.
         """
-        if not self.hooks:
+        if not self.hooks or self.ended:
             return bool(end_tick(self.world, command, k))
+        if not np.isfinite(command.tau).all():  # it might be made a number of
+            raise NonFiniteError("tau_cmd", command.tau.tolist())
         world, row = self.world, self.world.counts[ROWS]
         given = command._replace(tau=self.hooks.actuate(k * world.dt, command.tau))
         ended = bool(end_tick(world, given, k))
@@ -203,11 +219,48 @@ class Stage:
             world.rows[row, self.layout.slices["tau_cmd"]] = command.tau
         return ended
 
-    def divergence(self) -> NonFiniteError:
+    def divergence(self) -> EndedEarlyError:
         """Why the run must end, once the block of that tick is closed."""
-        if self.world.counts[STATUS] == OUT_OF_RANGE:
-            self.tick -= 1  # such a row is recorded
+        if self.world.counts[STATUS] in RECORDED:
+            self.tick -= 1
+        if self.world.counts[STATUS] == SAFELY_STOPPED:
+            return self._safe_stop()
         return why_it_ended(self.world, self.layout)
+
+    def check_end(self) -> None:
+        """Look at what no tick will look at any more, after the scenario's last one.
+
+        Raises:
+            NonFiniteError: the last step made a state that is not finite.
+            SafeStopError: a safe stop was under way.
+        """
+        for name, values in (("q", self.plant.q), ("qd", self.plant.qd)):
+            if not np.isfinite(values).all():
+                raise NonFiniteError(name, values.tolist())
+        if self.world.safety.ticks[0] and self.tick == self.scenario.n_ticks:
+            raise self._safe_stop()
+
+    def _told(self, rows: Array) -> Iterator[Event]:
+        """What a block's rows say has happened, and a safe stop that began in it."""
+        yield from self._changes.events(rows)
+        if self.world.safety.ticks[0] and not self._stop_told:
+            self._stop_told = True
+            t = self._stop_tick * self.scenario.dt
+            yield Event(t, "warning", f"safe stop: {self._tripped}")
+
+    def _safe_stop(self) -> SafeStopError:
+        t = self._stop_tick * self.scenario.dt
+        moving = self.world.safety.ticks[1] < self.world.safety.ends[1]
+        how = "still moving" if moving else "standing"
+        return SafeStopError(f"safe stop: {self._tripped}, at t = {t:.6g} s; {how}")
+
+    @property
+    def _stop_tick(self) -> int:
+        return int(self.world.safety.ticks[0]) - 1
+
+    @property
+    def _tripped(self) -> str:
+        return what_tripped(self.scenario.safety, self.world.safety)
 
     def _happen(self, recorder: Recorder) -> int:
         """Let every event up to this tick happen; the tick of the next one, or the last."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from dnnmso_mj.recorder import Recorder
+from dnnmso_mj.recording import McapRecorder
 from dnnmso_mj.trace import Event
 
 Array = np.ndarray
@@ -15,8 +16,13 @@ Array = np.ndarray
 class Tee:
     """Hands on all of a run to its log, then to its viewer."""
 
-    def __init__(self, log: Recorder, live: Recorder) -> None:
+    def __init__(self, log: McapRecorder, live: Recorder) -> None:
         self._log, self._live = log, live
+
+    @property
+    def block(self) -> int:
+        """What the log takes at once."""
+        return self._log.block
 
     def append(self, rows: Array) -> None:
         self._log.append(rows)

@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from dnnmso_mj.clock import now_ns, sleep_until
-from dnnmso_mj.compiling import compiled, copy, inner
+from dnnmso_mj.compiling import compiled, copy, inner, is_finite
 from dnnmso_mj.imperfections.actuators import GIVEN, Actuators, actuate
 from dnnmso_mj.imperfections.loads import BEFORE, Loads, load
 from dnnmso_mj.imperfections.sensors import Sensors, sense
 from dnnmso_mj.inversion import solve_spd
 from dnnmso_mj.plant import Nominal, PlantView, inertia, integrate, solve_inertia
+from dnnmso_mj.safety import Safety, has_stopped, is_stopping, stop
 from dnnmso_mj.theory import TrackingBounds, begin_period, end_period
 
 if TYPE_CHECKING:
@@ -36,9 +37,12 @@ Loop = Callable[["World", Any, int, int], int]
 # rad, rad/s: no arm is there and comes back.
 DIVERGED_ABOVE = 1e3
 MUJOCO_ZEROES_ABOVE = 1e9  # N·m; from 1e10 on MuJoCo drops a torque with a mere warning
+QDD_ABOVE = 1e10  # rad/s²; MuJoCo's own mark of a bad one, from where a step may overflow
 
 # Why a loop ended: values of the slot STATUS.
 RUNNING, TAU_NOT_FINITE, TAU_TOO_LARGE, ROW_NOT_FINITE, OUT_OF_RANGE = range(5)
+STATE_NOT_FINITE, READING_NOT_FINITE, LOAD_TOO_LARGE, SAFELY_STOPPED = range(5, 9)
+RECORDED = (OUT_OF_RANGE, SAFELY_STOPPED)  # whose last tick has a row
 
 # Slots of `World.counts`.
 STATUS, ROWS, CHUNK_START, START_NS, CONTROLLED, MISSED, STALLS, TOOK_NS = range(8)
@@ -64,6 +68,7 @@ class World(NamedTuple):
     sensors: Sensors
     actuators: Actuators
     loads: Loads
+    safety: Safety
     bounds: TrackingBounds
     pace: Pace
     reference: Array  # (chunk, 3n): q_ref, q̇_ref and q̈_ref of each tick,
@@ -120,7 +125,11 @@ def update(parts: Any, inputs: Inputs) -> None:
 
 @inner
 def begin_tick(world: World, k: int) -> bool:
-    """Wait for tick k, read sensors and reference; False where real time has passed all of it."""
+    """Wait for tick k, read sensors and reference.
+
+    False where real time has passed all of it, or where a state or a reading is not finite: neither
+    the controller nor MuJoCo is to see that.
+    """
     world.counts[TOOK_NS] = 0
     world.late_ns[0] = 0
     in_time = world.pace.period_ns == 0 or _wait(world, k)
@@ -135,7 +144,11 @@ def begin_tick(world: World, k: int) -> bool:
         world.x_ref[j], world.xd_ref[j] = world.reference[i, j], world.reference[i, n + j]
         inputs.x_ref[j], inputs.xd_ref[j] = world.ahead[i, j], world.ahead[i, n + j]
         world.e_track[j] = world.x[j] - world.x_ref[j]
-    return in_time
+        if not math.isfinite(world.x[j]):
+            world.counts[STATUS] = STATE_NOT_FINITE
+        elif not math.isfinite(inputs.x[j]) and world.counts[STATUS] == RUNNING:
+            world.counts[STATUS] = READING_NOT_FINITE
+    return in_time and world.counts[STATUS] == RUNNING
 
 
 @inner
@@ -153,40 +166,84 @@ def _wait(world: World, k: int) -> bool:
 @inner
 def end_tick(world: World, command: Command, k: int) -> bool:
     """Apply the command, record tick k and step the arm; True where the run must end."""
+    if world.counts[STATUS] != RUNNING:
+        return True
     missed = world.pace.period_ns > 0 and _too_late(world, k)
     world.counts[MISSED] = 1 if missed else 0
-    wanted = _watchdog(world) if missed else command.tau
-    saturated = actuate(world.actuators, wanted, k)
+    stopping = world.safety.guards and is_stopping(world.safety, world.x, k)
+    saturated = actuate(world.actuators, _wanted(world, command, missed, stopping), k)
     tau = world.actuators.tau
-    largest = 0.0
-    for j in range(tau.size):
-        largest = max(largest, abs(tau[j]))
-        if not math.isfinite(tau[j]):
-            world.counts[STATUS] = TAU_NOT_FINITE
-            return True
-    if largest > MUJOCO_ZEROES_ABOVE:
-        world.counts[STATUS] = TAU_TOO_LARGE
+    if not _drive(world, tau):
         return True
-    load(world.loads, world.plant, tau, world.dt)
     if k > 0:
         _end_period(world, tau)
-    _true_dynamics(world, command, tau, saturated or missed)
-    row = world.rows[world.counts[ROWS]]
-    fill(world, command, k, saturated, missed, row)
-    for value in row:
-        if not math.isfinite(value):
-            world.counts[STATUS] = ROW_NOT_FINITE
-            return True
-    world.counts[ROWS] += 1
-    for j in range(world.x.size):
-        if max(abs(world.x[j]), abs(command.x_hat[j])) > DIVERGED_ABOVE:
-            world.counts[STATUS] = OUT_OF_RANGE
-            return True
+    _true_dynamics(world, command, tau, saturated or missed or stopping)
+    if not _record(world, command, k, saturated, missed):
+        return True
+    if _is_out_of_range(world, command):
+        world.counts[STATUS] = OUT_OF_RANGE
+        return True
+    if stopping and has_stopped(world.safety, k):
+        world.counts[STATUS] = SAFELY_STOPPED
+        return True
     qdd_ref = world.xd_ref[tau.size :]
     begin_period(world.bounds, world.f_err, world.e_track, world.plant.qacc, qdd_ref)
     copy(tau, world.tau)
     integrate(world.plant)
     return False
+
+
+@inner
+def _wanted(world: World, command: Command, missed: bool, stopping: bool) -> Array:
+    """The torque (n,) N·m that the drives are given."""
+    if stopping:
+        return stop(world.safety, world.x, world.qdd)
+    if missed:
+        return _watchdog(world)
+    return command.tau
+
+
+@inner
+def _drive(world: World, tau: Array) -> bool:
+    """True q̈ under τ (n,) N·m and all loads; False where MuJoCo may not be given one of them."""
+    status = RUNNING
+    for j in range(tau.size):
+        if not math.isfinite(tau[j]):
+            status = TAU_NOT_FINITE
+        elif abs(tau[j]) > MUJOCO_ZEROES_ABOVE and status == RUNNING:
+            status = TAU_TOO_LARGE
+    if not (is_finite(world.plant.q) and is_finite(world.plant.qd)):
+        status = STATE_NOT_FINITE  # changed from outside since the tick began
+    if status == RUNNING and not load(world.loads, world.plant, tau, world.dt, MUJOCO_ZEROES_ABOVE):
+        status = LOAD_TOO_LARGE
+    world.counts[STATUS] = status
+    return status == RUNNING
+
+
+@inner
+def _record(world: World, command: Command, k: int, saturated: bool, missed: bool) -> bool:
+    """Tick k as the next row; False where it is not finite."""
+    row = world.rows[world.counts[ROWS]]
+    fill(world, command, k, saturated, missed, row)
+    for value in row:
+        if not math.isfinite(value):
+            world.counts[STATUS] = ROW_NOT_FINITE
+            return False
+    world.counts[ROWS] += 1
+    return True
+
+
+@inner
+def _is_out_of_range(world: World, command: Command) -> bool:
+    """Whether the arm, or what the controller takes for it, is where no arm is."""
+    far = False
+    for j in range(world.x.size):
+        if max(abs(world.x[j]), abs(command.x_hat[j])) > DIVERGED_ABOVE:
+            far = True
+    for j in range(world.tau.size):
+        if abs(world.plant.qacc[j]) > QDD_ABOVE:
+            far = True
+    return far
 
 
 @inner

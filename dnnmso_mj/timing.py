@@ -8,6 +8,7 @@ import numpy as np
 
 from dnnmso_mj.trace import Array, Trace
 
+TIMED = ("t", "compute_us", "wake_late_us", "deadline_missed")  # what it takes of a trace
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 
 

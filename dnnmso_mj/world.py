@@ -11,6 +11,7 @@ from dnnmso_mj.imperfections.sensors import Sensors
 from dnnmso_mj.imperfections.tip import Tip
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK
 from dnnmso_mj.plant import RK4, Nominal, Plant
+from dnnmso_mj.safety import build_safety
 from dnnmso_mj.scenario import Constant, Scenario
 from dnnmso_mj.scenario.controller import effectiveness, inversion, lookahead
 from dnnmso_mj.theory import build_bounds
@@ -48,6 +49,7 @@ def build_world(
         sensors=sensors,
         actuators=build_actuators(scenario.imperfections, n, dt),
         loads=build_loads(scenario, plant, tip),
+        safety=build_safety(scenario.safety, n, dt),
         bounds=build_bounds(law, n, dt, first_order=plant.view.integrator != RK4),
         pace=pace,
         reference=reference,

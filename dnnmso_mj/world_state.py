@@ -14,6 +14,7 @@ import numpy as np
 from dnnmso_mj.external.imperfection import Hooks
 from dnnmso_mj.imperfections.actuators import GIVEN, LAGGED
 from dnnmso_mj.plant import Plant
+from dnnmso_mj.safety import Q_STOP
 from dnnmso_mj.tick import World
 
 Array = np.ndarray
@@ -47,6 +48,7 @@ def capture(world: World, plant: Plant, hooks: Hooks, flags: Array) -> dict[str,
         sensors_past, sensors_last: true states and the last reading; see `Sensors`.
         bounds_…: of the tracking error, and what they are integrated with; see `TrackingBounds`.
         flags: as given.
+        safety_ticks, safety_state: of a safe stop, where the scenario has limits; see `Safety`.
         external.…: what imperfections from outside keep.
     """
     actuators, sensors, bounds = world.actuators, world.sensors, world.bounds
@@ -62,6 +64,9 @@ def capture(world: World, plant: Plant, hooks: Hooks, flags: Array) -> dict[str,
         "flags": flags,
         **{f"{EXTERNAL}{name}": values for name, values in hooks.state().items()},
     }
+    if world.safety.guards:
+        kept["safety_ticks"] = world.safety.ticks
+        kept["safety_state"] = world.safety.limits[Q_STOP:]
     state = {name: np.array(values) for name, values in kept.items()}
     if actuators.prompt:
         state["actuators_held"][LAGGED] = state["actuators_past"][:] = actuators.held[GIVEN]
@@ -83,6 +88,9 @@ def restore(world: World, plant: Plant, hooks: Hooks, state: Mapping[str, Array]
     world.sensors.last[:] = state["sensors_last"]
     for name in _BOUNDS:
         getattr(world.bounds, name)[:] = state[f"bounds_{name}"]
+    if world.safety.guards and "safety_ticks" in state:
+        world.safety.ticks[:] = state["safety_ticks"]
+        world.safety.limits[Q_STOP:] = state["safety_state"]
     outside = {n.removeprefix(EXTERNAL): v for n, v in state.items() if n.startswith(EXTERNAL)}
     if hooks:
         hooks.restore(outside)

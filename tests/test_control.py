@@ -147,6 +147,26 @@ def test_perfect_model_leaves_the_linear_error_equation(make_scenario, two_link)
     assert np.allclose(edd + (K + lam) * (qd - qd_ref) + K * lam * (q - q_ref), 0, atol=1e-10)
 
 
+def test_command_is_that_of_the_present_tick_alone(make_scenario, two_link):
+    nominal = NominalModel(make_scenario(), two_link)
+    once, twice = (build_inversion(Inversion(), 2, nominal.view) for _ in range(2))
+    before, now = np.random.default_rng(1).normal(size=(2, 4, 4))
+    invert(twice, *before)
+    for inversion in (once, twice):
+        invert(inversion, *now)
+    assert np.array_equal(once.tau, twice.tau)
+    assert np.array_equal(once.Bu, twice.Bu)
+
+
+def test_command_has_an_entry_for_each_joint_and_state():
+    inversion = build_inversion(Inversion(), 3, None)
+    assert inversion.tau.shape == (3,)
+    assert {array.shape for array in (inversion.Bu, inversion.K, inversion.r)} == {(6,)}
+    assert inversion.coupling.flags.c_contiguous
+    assert inversion.coupling.shape == (3, 3)
+    assert np.array_equal(inversion.B2_inv, np.eye(3))  # until a command has M(q)
+
+
 @given(arrays(float, (3, 3), elements=st.floats(-3, 3)), vectors(3))
 def test_cholesky_solves_as_numpy_does(root, b):
     A = root @ root.T + np.eye(3)

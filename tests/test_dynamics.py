@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pinocchio
 import pytest
@@ -10,11 +12,9 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from dnnmso_mj.check import TOLERANCE, check_dynamics
-from dnnmso_mj.dynamics import TwoLink
+from dnnmso_mj.dynamics import LINKS, Links, TwoLink
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.plant import Mjcf
-
-LINKS = ("point_mass", "rod")
 
 arms = st.builds(
     TwoLink,
@@ -136,6 +136,36 @@ def test_one_link_of_negligible_second_mass_is_a_pendulum():
     assert arm.inertia(q)[0, 0] == pytest.approx(M11)
     assert arm.gravity_torque(q)[0] == pytest.approx(G1)
     assert arm.acceleration(q, qd, tau)[0] == pytest.approx((1.0 - G1) / M11, rel=1e-6)
+
+
+def test_an_arm_has_point_masses_or_rods():
+    assert get_args(Links) == LINKS == ("point_mass", "rod")
+    assert TwoLink((1.0, 2.0), (1.0, 1.0)) == TwoLink((1.0, 2.0), (1.0, 1.0), 9.81, "point_mass")
+
+
+@pytest.mark.parametrize("links", LINKS)
+def test_many_states_at_once_are_as_one_after_the_other(links):
+    arm, rng = TwoLink((1.0, 2.3), (1.1, 0.7), 9.81, links), np.random.default_rng(0)
+    q, qd, tau = rng.normal(size=(3, 4, 5, 2))
+    for method, states in (
+        (arm.inertia, (q,)),
+        (arm.coriolis_matrix, (q, qd)),
+        (arm.coriolis, (q, qd)),
+        (arm.gravity_torque, (q,)),
+        (arm.acceleration, (q, qd, tau)),
+        (arm.energy, (q, qd)),
+    ):
+        together = method(*states)
+        for index in np.ndindex(4, 5):
+            alone = method(*(values[index] for values in states))
+            np.testing.assert_allclose(together[index], alone, rtol=1e-13, atol=1e-14)
+
+
+def test_an_arm_at_rest_along_the_horizontal_has_no_energy():
+    arm = TwoLink((1.0, 2.3), (1.1, 0.7))
+    assert arm.energy(np.zeros(2), np.zeros(2)) == 0.0
+    moving = arm.energy(np.zeros(2), np.array([2.0, 0.0]))
+    assert moving == pytest.approx(0.5 * (1.0 * 2.2**2 + 2.3 * 3.6**2))  # ½ m v² of both masses
 
 
 def test_holding_the_papers_arm_stretched_out_takes_54_9_newton_metres():

@@ -25,7 +25,8 @@ from dnnmso_mj.dynamics import TwoLink
 from dnnmso_mj.errors import ExternalError, ScenarioError
 from dnnmso_mj.external.reference import CHECKED, STEP
 from dnnmso_mj.loading import controller_kinds, load_scenario, require_trust, scenario_schema
-from dnnmso_mj.log.format import snapshot_arrays, snapshot_data
+from dnnmso_mj.log.format import snapshot_data
+from dnnmso_mj.log.npz import read_npz
 from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.paths import find_model, models_dir
 from dnnmso_mj.reading import read_trace
@@ -105,7 +106,7 @@ def test_a_run_again_and_a_restored_controller_go_on_alike(laws, two_link):
     one.reset(inputs.x)
     for _ in range(5):
         one.update(inputs)
-    state = snapshot_arrays(snapshot_data(one.state()))  # through a log
+    state = read_npz(snapshot_data(one.state()))  # through a log
     other.restore(state)
     for _ in range(5):
         assert np.array_equal(one.update(inputs).tau, other.update(inputs).tau)
@@ -403,7 +404,7 @@ def test_one_goes_on_from_its_state(laws, two_link):
     x = np.zeros(4)
     for _ in range(3):
         one.sense(0.0, x)
-    other.restore(snapshot_arrays(snapshot_data(one.state())))
+    other.restore(read_npz(snapshot_data(one.state())))
     ours, theirs = np.zeros((2, 4))
     one.sense(0.0, ours)
     other.sense(0.0, theirs)

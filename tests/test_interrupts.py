@@ -99,7 +99,7 @@ def test_a_ctrl_c_while_a_whole_run_ends_changes_nothing(tmp_path, monkeypatch):
 
     with pytest.raises(RunInterrupted) as interrupted:
         run_logged(scenario, tmp_path / "stopped.mcap", progress=stop)
-    assert interrupted.value.ticks == len(interrupted.value.trace) > 0
+    assert interrupted.value.ticks == len(interrupted.value.run.trace) > 0
     assert log_info(tmp_path / "stopped.mcap").complete
 
 

@@ -22,9 +22,10 @@ from vulkan import needs_vulkan
 from dnnmso_mj.cli.live import live_view
 from dnnmso_mj.errors import DnnmsoError, MissingExtraError
 from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.logged import LoggedRun
 from dnnmso_mj.reading import log_info
 from dnnmso_mj.replay import save_rrd
-from dnnmso_mj.run import LoggedRun, run_logged
+from dnnmso_mj.run import run_logged
 from dnnmso_mj.viewer import live
 from dnnmso_mj.viewer.live import connected, served, started, window
 from dnnmso_mj.viewer.process import LOCAL, data_address, free_port, listens, rerun

@@ -123,7 +123,8 @@ def test_dm_control_steps_the_same_model_to_the_same_state(make_scenario, two_li
         ('name="motor1" joint="joint1"', 'name="motor1" joint="joint2"', "order of the joints"),
         ('name="motor1" joint="joint1"', 'name="motor1" site="tip"', "order of the joints"),
         ('name="link2"', 'name="forearm"', "no body 'link2'"),
-        ("<worldbody>", "<wordbody>", "MuJoCo says"),
+        ("<worldbody>", "<wordbody>", "not XML: mismatched tag"),
+        ('<joint name="joint1"', '<joint nome="joint1"', "MuJoCo says"),
     ],
 )
 def test_models_it_cannot_drive_are_refused_by_name(make_scenario, two_link, old, new, message):
@@ -156,9 +157,10 @@ def test_includes_are_put_in_and_assets_found_beside_the_model(make_scenario, tw
 
 def test_an_include_that_is_missing_or_includes_itself_is_refused(two_link, tmp_path):
     text = two_link.text.replace("<sensor>", '<include file="arm.xml"/><sensor>')
-    for name, content in (("arm.xml", text), ("lost.xml", text.replace("arm.xml", "no.xml"))):
+    lost = text.replace("arm.xml", "no.xml")
+    for name, content, why in (("arm.xml", text, "again"), ("lost.xml", lost, "no such file")):
         (tmp_path / name).write_text(content)
-        with pytest.raises(ScenarioError, match="cannot read"):
+        with pytest.raises(ScenarioError, match=why):
             Mjcf.read(tmp_path / name)
 
 

@@ -131,7 +131,7 @@ class Gymnasium:
 def arms(scenario: Scenario, mjcf: Mjcf) -> dict[str, Callable[[], Arm]]:
     """Name -> maker of an arm at the scenario's start; a maker may raise ImportError."""
     n = scenario.n_joints
-    xml = mjcf.text  # N.B. MjSpec.to_xml rounds the inertia of a point mass to zero
+    xml = mjcf.checked  # N.B. MjSpec.to_xml rounds the inertia of a point mass to zero
     q = np.array(scenario.initial.q)
     qd = np.resize(np.array(scenario.initial.qd), n)
     return {

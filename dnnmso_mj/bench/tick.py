@@ -129,7 +129,7 @@ def _logged(scenario: Scenario) -> Probe:
     def probe() -> Array:
         with tempfile.TemporaryDirectory() as folder:
             run = run_logged(scenario, Path(folder) / "bench.mcap")
-        return np.array([run.trace.info.wall_s / scenario.n_ticks * US_PER_S])
+        return np.array([run.info.wall_s / scenario.n_ticks * US_PER_S])
 
     return probe
 

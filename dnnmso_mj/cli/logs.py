@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from dnnmso_mj.cli.live import LOCAL, Bind, Port, require_page
 from dnnmso_mj.cli.shared import Json, Log, Logs, listing, number, print_table, working
 from dnnmso_mj.extras import require
 
@@ -18,14 +19,14 @@ def plot(
 ) -> None:
     """Draw the paper's figures and the theory from logs; several are compared."""
     require("plot", "dnnmso plot")
+    from dnnmso_mj.logged import read_drawn
     from dnnmso_mj.plots import save_comparison, save_figures
-    from dnnmso_mj.reading import read_trace
 
     folder = out or logs[0].parent
     names = [log.stem for log in logs]
     if len(set(names)) < len(names):
         names = [f"{k}-{name}" for k, name in enumerate(names, start=1)]
-    traces = [read_trace(log) for log in logs]
+    traces = [read_drawn(log) for log in logs]
     figures = []
     with working("drawing figures"):
         # First what may be refused, so that nothing is left behind.
@@ -40,8 +41,11 @@ def replay(
     logs: Logs,
     save: Annotated[Path | None, typer.Option(help="Write a Rerun recording (.rrd).")] = None,
     screenshot: Annotated[Path | None, typer.Option(help="Write a picture (.png).")] = None,
-    serve: Annotated[bool, typer.Option(help="Serve the web viewer on 127.0.0.1.")] = False,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Of --serve.")] = 9090,
+    serve: Annotated[
+        bool, typer.Option("--serve", help="Serve the web viewer on this machine, until Ctrl-C.")
+    ] = False,
+    port: Port = 9090,
+    bind: Bind = LOCAL,
     at: Annotated[float | None, typer.Option(help="Time of --screenshot (s).")] = None,
     tab: Annotated[str, typer.Option(help="The tab that is open at first.")] = "Tracking",
     side_by_side: Annotated[
@@ -49,6 +53,7 @@ def replay(
     ] = False,
 ) -> None:
     """Open a log, or up to eight to compare, in the Rerun viewer."""
+    require_page(serve, bind)
     require("viewer", "dnnmso replay")
     from dnnmso_mj import replay as viewer
 
@@ -61,7 +66,7 @@ def replay(
             viewer.screenshot(logs, screenshot, t=at, tab=tab, side_by_side=side_by_side)
         print(screenshot)
     if serve:
-        viewer.serve(logs, port, tab, side_by_side=side_by_side)
+        viewer.serve(logs, port, tab, side_by_side=side_by_side, bind=bind)
     elif save is None and screenshot is None:
         viewer.open_viewer(logs, tab, side_by_side=side_by_side)
 

@@ -22,7 +22,7 @@ from dnnmso_mj.cli.shared import (
     print_table,
     progress_bar,
 )
-from dnnmso_mj.errors import RunInterrupted
+from dnnmso_mj.errors import RunInterrupted, UnloggedRunError
 from dnnmso_mj.wording import show
 
 if TYPE_CHECKING:
@@ -47,7 +47,6 @@ def resume(
 ) -> None:
     """Go on from any tick of a log: bit for bit, or with something changed."""
     from dnnmso_mj.resume import resume as resume_log
-    from dnnmso_mj.run import LoggedRun
 
     plot = plot and can_draw()
     sets = overrides or []
@@ -56,12 +55,15 @@ def resume(
             done = resume_log(log, at, sets, out, force=force, trust=trust, progress=progress)
     except RunInterrupted as stop:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # all that is left is to say what was run
-        if stop.trace is not None and (stop.ticks or as_json):
-            tell(LoggedRun(stop.trace, stop.log), [], as_json=as_json, real_time=False)
+        if stop.ticks or as_json:
+            tell(stop.run, [], as_json=as_json, real_time=False)
         raise KeyboardInterrupt(f"log: {near(stop.log)} ({stop.ticks} ticks)") from stop
+    except UnloggedRunError as error:
+        tell(error.run, [], as_json=as_json, real_time=False)
+        raise
     figures, undrawn = draw(done.run) if plot else ([], None)
     _tell(done, log, sets, figures, as_json=as_json)
-    info = done.run.trace.info
+    info = done.run.info
     if undrawn is not None:
         raise undrawn
     if info.status == "diverged":
@@ -72,13 +74,13 @@ def resume(
 def _tell(
     done: Resumed, source: Path, sets: list[str], figures: list[Path], *, as_json: bool
 ) -> None:
-    trace, info = done.run.trace, done.run.trace.info
-    t = done.tick * trace.scenario.dt
+    scenario, info = done.run.scenario, done.run.info
+    t = done.tick * scenario.dt
     if as_json:
         print(json.dumps({
             "status": info.status,
             "reason": info.reason,
-            "scenario": trace.scenario.name,
+            "scenario": scenario.name,
             "source": str(source),
             "at": t,
             "checked_ticks": done.checked,
@@ -90,7 +92,7 @@ def _tell(
             "metrics": dict(info.metrics),
         }))  # fmt: skip
         return
-    print_summary(trace, done.run.log, figures, since=done.tick)
+    print_summary(done.run, figures, since=done.tick)
     print(
         f"resumed  {near(source)} at {t:g} s; the {done.checked} ticks before were computed again"
     )

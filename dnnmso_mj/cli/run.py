@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dnnmso_mj.cli.live import Port, Serve, View, live_view
+from dnnmso_mj.cli.live import LOCAL, Bind, Port, Serve, View, live_view
 from dnnmso_mj.cli.shared import (
     DIVERGED,
     Json,
@@ -24,15 +24,21 @@ from dnnmso_mj.cli.shared import (
     progress_bar,
     working,
 )
-from dnnmso_mj.errors import DnnmsoError, MissingExtraError, RunInterrupted, ScenarioError
+from dnnmso_mj.errors import (
+    DnnmsoError,
+    MissingExtraError,
+    RunInterrupted,
+    ScenarioError,
+    UnloggedRunError,
+)
 from dnnmso_mj.extras import require
 
 if TYPE_CHECKING:
-    from dnnmso_mj.run import LoggedRun
+    from dnnmso_mj.logged import LoggedRun
     from dnnmso_mj.timing import Timing
-    from dnnmso_mj.trace import Trace
 
 MISSES_SHOWN = 20
+ENDED_EARLY = ("interrupted", "failed")
 UNITS = {
     "rmse": "rad",
     "rmse_steady": "rad",
@@ -60,18 +66,19 @@ def run(
     view: View = False,
     serve: Serve = False,
     port: Port = 9090,
+    bind: Bind = LOCAL,
     plot: Annotated[bool, typer.Option(help="Draw the figures beside the log.")] = True,
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Run a scenario: log, figures, summary."""
     from dnnmso_mj.loading import load_scenario, located
-    from dnnmso_mj.run import LoggedRun, run_logged
+    from dnnmso_mj.run import run_logged
 
     plot = plot and can_draw()
     sets = [*(overrides or []), *([] if seed is None else [f"seed={seed}"])]
     loaded = load_scenario(scenario, sets, trust=trust)
-    with live_view(view, serve, port) as live:
+    with live_view(view, serve, port, bind) as live:
         try:
             with progress_bar(f"{loaded.name}", loaded.n_ticks) as progress:
                 done = run_logged(
@@ -81,16 +88,19 @@ def run(
             raise located(error, scenario, sets) from error
         except RunInterrupted as stop:
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # all that is left is to say what was run
-            if stop.trace is not None and (stop.ticks or as_json):
-                tell(LoggedRun(stop.trace, stop.log), [], as_json=as_json, real_time=real_time)
+            if stop.ticks or as_json:
+                tell(stop.run, [], as_json=as_json, real_time=real_time)
             ran = f"{stop.ticks * loaded.dt:g} s of {loaded.duration:g} s"
             raise KeyboardInterrupt(f"log: {near(stop.log)} ({ran})") from stop
+        except UnloggedRunError as error:
+            tell(error.run, [], as_json=as_json, real_time=False)
+            raise
         figures, undrawn = draw(done) if plot else ([], None)
         tell(done, figures, as_json=as_json, real_time=real_time)
     if undrawn is not None:
         raise undrawn
-    if done.trace.info.status == "diverged":
-        print(f"diverged: {done.trace.info.reason}", file=sys.stderr)
+    if done.info.status == "diverged":
+        print(f"diverged: {done.info.reason}", file=sys.stderr)
         raise typer.Exit(DIVERGED)
 
 
@@ -106,59 +116,60 @@ def can_draw() -> bool:
 
 def draw(done: LoggedRun) -> tuple[list[Path], DnnmsoError | None]:
     """The figures beside the log, and why there are none of those that could not be written."""
-    if len(done.trace) == 0:
+    if done.ticks == 0:
         return [], None
     from dnnmso_mj.plots import save_figures
 
     try:
         with working("drawing figures"):
-            return save_figures(done.trace, done.log.parent, done.log.stem), None
+            name = done.log.name.removesuffix(".mcap")
+            return save_figures(done.drawn(), done.log.parent, name), None
     except DnnmsoError as error:
         return [], error
 
 
 def tell(done: LoggedRun, figures: list[Path], *, as_json: bool, real_time: bool) -> None:
     """A run's summary, as a table or as one JSON object."""
-    from dnnmso_mj.timing import timing
+    from dnnmso_mj.timing import TIMED, timing
 
-    info = done.trace.info
+    info = done.info
     if as_json:
         print(json.dumps({
             "status": info.status,
             "reason": info.reason,
-            "scenario": done.trace.scenario.name,
+            "scenario": done.scenario.name,
             "log": str(done.log),
             "figures": [str(figure) for figure in figures],
             "seed": info.seed,
             "wall_s": info.wall_s,
             "metrics": dict(info.metrics),
-            **({"real_time": asdict(timing(done.trace))} if real_time else {}),
+            **({"real_time": asdict(timing(done.part(*TIMED)))} if real_time else {}),
         }))  # fmt: skip
     else:
-        print_summary(done.trace, done.log, figures)
+        print_summary(done, figures)
         if real_time:
-            _print_timing(timing(done.trace))
+            _print_timing(timing(done.part(*TIMED)))
 
 
-def print_summary(trace: Trace, log: Path, figures: list[Path], since: int = 0) -> None:
+def print_summary(done: LoggedRun, figures: list[Path], since: int = 0) -> None:
     """Metrics, speed and files of a run, of which the ticks from `since` on were simulated now."""
     from rich.table import Table
 
-    info = trace.info
-    table = Table(title=f"{trace.scenario.name}, seed {info.seed}: {info.status}")
+    info, scenario = done.info, done.scenario
+    table = Table(title=f"{scenario.name}, seed {info.seed}: {info.status}")
     table.add_column("metric")
     table.add_column("value", justify="right")
     table.add_column("unit")
     for name, value in info.metrics.items():
         table.add_row(name, number(value), UNITS.get(name, ""))
     print_table(table, soft_wrap=True)
-    simulated = (len(trace) - since) * trace.scenario.dt
-    whole = f" of {trace.scenario.duration:g} s" if info.status == "interrupted" else ""
+    simulated = (done.ticks - since) * scenario.dt
+    whole = f" of {scenario.duration:g} s" if info.status in ENDED_EARLY else ""
     print(f"{simulated:g} s{whole} simulated in {info.wall_s:.2f} s")
-    print(f"log      {near(log)}")
+    print(f"log      {near(done.log)}")
     for figure in figures:
         print(f"figure   {near(figure)}")
-    print(f"replay   dnnmso replay {near(log)}")
+    print(f"replay   dnnmso replay {near(done.log)}")
 
 
 def _print_timing(timing: Timing) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from dnnmso_mj.compile_loop import compile_halves_elsewhere
 from dnnmso_mj.consistency import MULTIPLE, is_multiple
 from dnnmso_mj.controllers.measured import empty_command, show_measured
-from dnnmso_mj.errors import DnnmsoError, NonFiniteError, ScenarioError
+from dnnmso_mj.errors import DnnmsoError, EndedEarlyError, ScenarioError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.memory_recorder import MemoryRecorder
 from dnnmso_mj.metrics import Metrics, compute_metrics
@@ -97,7 +97,7 @@ class Episode:
         self._stage.vary(scenario)
         self._stage.start()
         self._open_block()
-        self._stage.sense(0)
+        self._sense()
 
     def observation(self) -> Array:
         """What is told of the present tick: a new vector (6n,); see `observation`."""
@@ -183,16 +183,28 @@ class Episode:
             if self._tick == self._block_end:
                 stage.close_block(self._recorder)
                 self._open_block()
-            stage.sense(self._tick)
-        except NonFiniteError as error:  # of an imperfection from outside
+            self._sense()
+            if self.over and not self.error:
+                stage.check_end()
+        except EndedEarlyError as error:  # of an imperfection from outside, or at the end
             stage.close_block(self._recorder)
             self._end_early(error)
+
+    def _sense(self) -> None:
+        """What is told of the present tick; the last one's once more, if that is not finite."""
+        stage, told = self._stage, self._stage.world.inputs.x
+        before = told.copy()
+        stage.sense(self._tick)
+        if stage.ended:
+            stage.close_block(self._recorder)
+            self._end_early(stage.divergence())
+            told[:] = before
 
     def _open_block(self) -> None:
         """Rows are kept block by block, as a run's are; what is due now happens."""
         self._block_end = self._stage.open_block(self._recorder)
 
-    def _end_early(self, error: NonFiniteError) -> None:
+    def _end_early(self, error: EndedEarlyError) -> None:
         self._tick = self._stage.tick
         self.over, self.error = True, f"{error} at t = {self.t:.6g} s"
         self._recorder.event(Event(self.t, "error", f"diverged: {self.error}"))

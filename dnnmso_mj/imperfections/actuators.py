@@ -25,6 +25,8 @@ DECAY, INPUT, STATE = range(3)
 # Rows of `Actuators.held`.
 GIVEN, LAGGED = range(2)
 
+ROUNDING = 1e-12  # of a mean of two torques, in parts of it; a few times more than it can be
+
 
 class Actuators(NamedTuple):
     """The drives, each joint with its own limits."""
@@ -85,7 +87,9 @@ def actuate(actuators: Actuators, tau_cmd: Array, k: int) -> bool:
     """Pass tick k's command (n,) N·m on; whether a limit changed it."""
     saturated = _limit(tau_cmd, actuators.limits, actuators.held, actuators.tau)
     if not actuators.prompt:
-        _respond(k, actuators.held, actuators.past, actuators.parts, actuators.tau)
+        _respond(
+            k, actuators.limits, actuators.held, actuators.past, actuators.parts, actuators.tau
+        )
     return saturated
 
 
@@ -107,8 +111,12 @@ def _limit(tau_cmd: Array, limits: Array, held: Array, tau: Array) -> bool:
 
 
 @compiled
-def _respond(k: int, held: Array, past: Array, parts: Array, tau: Array) -> None:
-    """Delay and lag: from tick k's command in `tau` to its period's mean."""
+def _respond(k: int, limits: Array, held: Array, past: Array, parts: Array, tau: Array) -> None:
+    """Delay and lag: from tick k's command in `tau` to its period's mean.
+
+    A mean of torques within the limit is within it, but for rounding, which is cut off; what is
+    further out, or no number, was not made here and must be seen.
+    """
     size = len(past)
     whole = size - 2
     for i in range(tau.size):
@@ -118,4 +126,7 @@ def _respond(k: int, held: Array, past: Array, parts: Array, tau: Array) -> None
             u = past[(k - whole - 1 + part) % size, i]
             mean += u * parts[part, INPUT] + (y - u) * parts[part, STATE]
             y = u + (y - u) * parts[part, DECAY]
+        most = limits[0, i]
+        if most < abs(mean) < most * (1.0 + ROUNDING):
+            mean = math.copysign(most, mean)
         tau[i], held[LAGGED, i] = mean, y

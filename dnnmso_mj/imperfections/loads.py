@@ -67,13 +67,16 @@ def start_loads(loads: Loads) -> None:
 
 
 @inner
-def load(loads: Loads, plant: PlantView, tau: Array, dt: float) -> None:
-    """Begin a period in which the motors give τ (n,) N·m: true q̈ under it and all loads."""
+def load(loads: Loads, plant: PlantView, tau: Array, dt: float, most: float) -> bool:
+    """Begin a period in which the motors give τ (n,) N·m: true q̈ under it and all loads.
+
+    False where a load is above `most` or no number: then MuJoCo is not given it.
+    """
     if loads.acting:
         _push(
             plant.model, plant.data, loads.site, loads.push, loads.held, loads.torque, loads.scratch
         )
-        if loads.dry:
+        if loads.dry and is_within(loads.torque, most):
             forward(plant, tau)
             rub(
                 plant.model,
@@ -87,7 +90,19 @@ def load(loads: Loads, plant: PlantView, tau: Array, dt: float) -> None:
             )
             for j in range(tau.size):
                 loads.torque[j] += loads.held[FRICTION, j]
+    if not is_within(loads.torque, most):
+        return False
     forward(plant, tau)
+    return True
+
+
+@compiled
+def is_within(values: Array, most: float) -> bool:
+    """Whether every |value| is a number of at most `most`."""
+    within = True
+    for value in values:
+        within = within and abs(value) <= most
+    return within
 
 
 @compiled

@@ -14,7 +14,8 @@ class Background:
     """Does jobs in the order they were given, in a daemon thread.
 
     Giving one takes a microsecond and never waits, unless jobs of more than `limit` bytes wait to
-    be done: then the caller does too, until all are, and `waited_s` says for how long.
+    be done: then the caller does too, until no more than that are, and `waited_s` says for how
+    long.
 
     After a job's exception the rest are dropped; `put` and `drain` raise it.
 
@@ -29,6 +30,7 @@ class Background:
         self._jobs = queue.SimpleQueue()
         self._put_off: list[tuple[Job, int]] = []
         self._given = self._done = 0  # bytes; the caller writes one, the thread the other
+        self._room = threading.Event()
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._work, name="dnnmso-log", daemon=True)
         self._thread.start()
@@ -41,9 +43,7 @@ class Background:
             self._given += given[1]
         self._put_off.clear()
         if self._given - self._done > self._limit:
-            started = time.perf_counter()
-            self.drain()
-            self.waited_s += time.perf_counter() - started
+            self._wait_for_room()
 
     def put_off(self, job: Job, size: int = 0) -> None:
         """Have a job done before the next one that is `put`, which alone wakes the thread.
@@ -59,6 +59,16 @@ class Background:
         reached = threading.Event()
         self._jobs.put(reached)
         reached.wait()
+        if self._error is not None:
+            raise self._error
+
+    def _wait_for_room(self) -> None:
+        started = time.perf_counter()
+        while self._given - self._done > self._limit:
+            self._room.clear()
+            if self._given - self._done > self._limit:  # what came before `clear` is not missed
+                self._room.wait()
+        self.waited_s += time.perf_counter() - started
         if self._error is not None:
             raise self._error
 
@@ -79,4 +89,5 @@ class Background:
                 except Exception as error:  # whatever it is, the caller is to be told
                     self._error = error
             self._done += size
+            self._room.set()
             del given, job  # frees the block before the next one comes

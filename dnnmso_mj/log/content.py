@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -35,12 +36,13 @@ from dnnmso_mj.trace import Event, StepLayout
 
 Array = np.ndarray
 
-_BLOCK_S = 0.05  # simulated time that waits for a chunk to be full
+_WAIT_S = 0.02  # simulated time, and wall time, that waits for a chunk to be full
+_MOST_TICKS = 50  # in a chunk
 _TF_PERIOD_S = 0.01
 
 
 class LogContent:
-    """Writes rows, events, frames and snapshots of one run; a row waits until its block is full.
+    """Writes rows, events, frames and snapshots of one run; few rows wait for more, a short while.
 
     Args:
         writer: of a new file.
@@ -61,10 +63,11 @@ class LogContent:
         self._scene = scene
         self._format = StepFormat(layout)
         self._frames = FrameMessages(scene)
-        ticks = int(_BLOCK_S / scenario.dt + 1e-9)
-        fitting = CHUNK_BYTES // (HEADER_SIZE + self._format.size)
-        self._block = np.empty((max(1, min(ticks, fitting)), layout.width))
+        fitting = max(1, CHUNK_BYTES // (HEADER_SIZE + self._format.size))
+        self._block = np.empty((min(_MOST_TICKS, fitting), layout.width))
+        self._enough = min(len(self._block), max(1, int(_WAIT_S / scenario.dt + 1e-9)))
         self._filled = 0
+        self._flushed = time.monotonic()
         self._written = 0  # ticks
         self._tf_stride = max(1, int(np.ceil(_TF_PERIOD_S / scenario.dt - 1e-9)))
         self._channels: dict[str, int] = {}
@@ -95,13 +98,16 @@ class LogContent:
         writer.flush()
 
     def take(self, rows: Array) -> None:
-        """Add rows to the block in progress, and write those blocks that are full."""
+        """Add rows to the block in progress, and write it once it holds enough."""
         while len(rows):
             part = rows[: len(self._block) - self._filled]
             self._block[self._filled : self._filled + len(part)] = part
             self._filled += len(part)
             rows = rows[len(part) :]
-            if self._filled == len(self._block):
+            late = time.monotonic() - self._flushed > _WAIT_S
+            if self._filled == len(self._block) or (
+                not len(rows) and (self._filled >= self._enough or late)
+            ):
                 self.flush()
 
     def attach_snapshot(self, name: str, t: float, arrays: Mapping[str, Array]) -> None:
@@ -127,6 +133,7 @@ class LogContent:
             self._writer.add_message(self._channels[EVENTS.name], time_ns, event_message(event))
         self.events.clear()
         self._writer.flush()
+        self._flushed = time.monotonic()
 
     def finish(self, records: Mapping[str, dict[str, str]]) -> None:
         """Write what is left, metadata records and the end of the file."""

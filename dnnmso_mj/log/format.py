@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -16,16 +16,18 @@ from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap.writer import MCAP0_MAGIC
 
 from dnnmso_mj.errors import LogError
 from dnnmso_mj.log import step_message
+from dnnmso_mj.log.json_texts import read_json
 from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.trace import Event, RunInfo
+from dnnmso_mj.wording import show
 
 Array = np.ndarray
 
 NS_PER_S = 1_000_000_000
+LONGEST = 1e9  # s; what is of a later time was no run's
 MODEL = "model.xml"  # the attachment that holds the MJCF
 _SNAPSHOT, _NPZ = "snapshot/", ".npz"
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
@@ -69,47 +71,6 @@ STEP = Topic(
 EVENTS = protobuf_topic("/events", Log.DESCRIPTOR.file, "foxglove.Log")
 
 
-def create(path: Path, force: bool = False) -> BinaryIO:
-    """Open a new file, in a folder that is made when missing.
-
-    Raises:
-        LogError: the file exists and `force` does not say to remove it, or is no log, or cannot be
-            written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if force:
-            _remove_log(path)
-        return _open_new(path)
-    except OSError as error:
-        raise unwritable(path, error) from error
-
-
-def _remove_log(path: Path) -> None:
-    """Remove a file that begins like a log; what is no log is never removed."""
-    if not path.exists():
-        return
-    magic = b""
-    if path.is_file():  # opening a FIFO would wait for a writer
-        with path.open("rb") as file:
-            magic = file.read(len(MCAP0_MAGIC))
-    if magic != MCAP0_MAGIC:
-        raise LogError(
-            f"{path} is no log (an MCAP file), and --force replaces nothing else. "
-            "Choose another name."
-        )
-    path.unlink()
-
-
-def _open_new(path: Path) -> BinaryIO:
-    try:
-        return path.open("xb")
-    except FileExistsError as error:
-        raise LogError(
-            f"{path} exists already. Choose another name, or replace it with --force."
-        ) from error
-
-
 def unwritable(path: Path, error: OSError) -> LogError:
     """The error to raise when the operating system does not let a file be written."""
     return LogError(
@@ -144,6 +105,8 @@ def event_of(data: bytes) -> Event:
     except DecodeError as error:
         raise ValueError(f"a message is no {EVENTS.schema_name}") from error
     t = (message.timestamp.seconds * NS_PER_S + message.timestamp.nanos) / NS_PER_S
+    if not 0.0 <= t <= LONGEST:
+        raise ValueError(f"an event of {t:g} s; expected 0 to {LONGEST:g}")
     return Event(t, _LEVEL_NAMES.get(message.level, "info"), message.message)
 
 
@@ -188,15 +151,27 @@ def run_info(records: Mapping[str, Mapping[str, str]]) -> RunInfo:
         ValueError: a value is not of its type.
     """
     run = {"status": "unfinished", **records.get("scenario", {}), **records.get("run", {})}
+    wall_s, seed = float(run.get("wall_s", "0")), int(run.get("seed", "0"))
+    if not math.isfinite(wall_s) or abs(seed) >= 1 << 64:
+        raise ValueError(f"seed = {show(run['seed'])}, wall_s = {wall_s}")
+    metrics = {name: _metric(name, text) for name, text in records.get("metrics", {}).items()}
     return RunInfo(
         status=run["status"],
-        seed=int(run.get("seed", "0")),
-        wall_s=float(run.get("wall_s", "0")),
+        seed=seed,
+        wall_s=wall_s,
         reason=run.get("reason", ""),
         versions=dict(records.get("versions", {})),
         git_commit=records.get("git", {}).get("commit", ""),
-        metrics={name: json.loads(value) for name, value in records.get("metrics", {}).items()},
+        metrics=metrics,
     )
+
+
+def _metric(name: str, text: str) -> float | int | bool | None:
+    value = read_json(text)
+    whole = isinstance(value, int) and abs(value) < 1 << 64  # bool too
+    if not (value is None or whole or (isinstance(value, float) and math.isfinite(value))):
+        raise ValueError(f"metric {show(name)} = {show(value)}")
+    return value  # type: ignore[no-any-return]
 
 
 def snapshot_name(name: str, t: float) -> str:
@@ -210,6 +185,8 @@ def snapshot_place(attachment: str) -> tuple[str, float] | None:
     try:
         place = name, float(t)
     except ValueError:
+        return None
+    if not 0.0 <= place[1] <= LONGEST:
         return None
     return place if attachment == snapshot_name(*place) else None
 
@@ -236,16 +213,3 @@ def snapshot_data(arrays: Mapping[str, Array]) -> bytes:
             with archive.open(f"{key}.npy", "w") as file:
                 np.lib.format.write_array(file, array, allow_pickle=False)
     return data.getvalue()
-
-
-def snapshot_arrays(data: bytes) -> dict[str, Array]:
-    """Arrays from NumPy's npz, without pickle.
-
-    Raises:
-        ValueError: the bytes are no such file.
-    """
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except Exception as error:  # of many kinds: whatever damaged bytes provoke
-        raise ValueError("no npz file of plain arrays") from error

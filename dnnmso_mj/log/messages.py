@@ -5,18 +5,18 @@ header, two times, a number and the data. NumPy lays out and reads such a table 
 library that handles messages singly takes 10 µs for each.
 """
 
-# mypy: untyped-calls-exclude=mcap
 from __future__ import annotations
 
-import io
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
+
+from dnnmso_mj.log import records
+from dnnmso_mj.log.records import DamagedError
 
 Array = np.ndarray
 
@@ -48,6 +48,9 @@ class Messages:
     def __len__(self) -> int:
         return len(self.data)
 
+    def __getitem__(self, part: slice) -> Messages:
+        return Messages(self.channel_id, self.time_ns[part], self.sequence[part], self.data[part])
+
 
 def pack(messages: Messages) -> bytes:
     """The MCAP records of messages, one after the other."""
@@ -71,14 +74,17 @@ def unpack(chunk: bytes) -> Iterator[Messages | Schema | Channel]:
     """The records of a chunk's content; messages that are alike come together.
 
     Raises:
-        ValueError, struct.error, EndOfFile: the bytes are no such records.
+        DamagedError: the bytes are no such records.
     """
     at = 0
     while at < len(chunk):
+        if len(chunk) - at < RECORD.size:
+            raise DamagedError("a record that ends behind its chunk")
         opcode, length = RECORD.unpack_from(chunk, at)
         end = at + RECORD.size + length
         if end > len(chunk):
-            raise ValueError("a record that ends behind its chunk")
+            raise DamagedError("a record that ends behind its chunk")
+        body = memoryview(chunk)[at + RECORD.size : end]
         if opcode == Opcode.MESSAGE:
             table = _table(chunk, at, end - at)
             header = table[:, :HEADER_SIZE].view(_HEADER)[:, 0]
@@ -89,15 +95,25 @@ def unpack(chunk: bytes) -> Iterator[Messages | Schema | Channel]:
                 data=table[:, HEADER_SIZE:],
             )
             end = at + table.size
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            kind = Schema if opcode == Opcode.SCHEMA else Channel
-            yield kind.read(ReadDataStream(io.BytesIO(chunk[at + RECORD.size : end])))
+        elif opcode == Opcode.SCHEMA:
+            yield records.schema(body)
+        elif opcode == Opcode.CHANNEL:
+            yield records.channel(body)
+        else:
+            raise DamagedError(f"a record of kind {opcode} in a chunk")
         at = end
 
 
 def _table(chunk: bytes, at: int, stride: int) -> Array:
     """The message record at `at` and those behind it of its channel and size, (N, stride)."""
-    count = (len(chunk) - at) // stride
-    table = np.frombuffer(chunk, np.uint8, count * stride, at).reshape(count, stride)
-    alike = (table[:, :_SAME] == table[0, :_SAME]).all(axis=1)
-    return table if alike.all() else table[: int(alike.argmin())]
+    if stride < HEADER_SIZE:
+        raise DamagedError("a message that ends in its header")
+    most = (len(chunk) - at) // stride
+    table = np.frombuffer(chunk, np.uint8, most * stride, at).reshape(most, stride)
+    count, ahead = 1, 16  # looking twice as far each time: few are found as fast as many
+    while count < most:
+        alike = (table[count : count + ahead, :_SAME] == table[0, :_SAME]).all(axis=1)
+        if not alike.all():
+            return table[: count + int(alike.argmin())]
+        count, ahead = count + len(alike), 2 * ahead
+    return table

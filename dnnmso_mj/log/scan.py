@@ -1,6 +1,5 @@
 """One pass over a log: what it holds, checked to be a log of this package."""
 
-# mypy: untyped-calls-exclude=mcap
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -12,41 +11,17 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from pydantic import ValidationError
 
 from dnnmso_mj.errors import LogError
+from dnnmso_mj.log import limits
 from dnnmso_mj.log.format import EVENTS, STEP, event_of, run_info
+from dnnmso_mj.log.json_texts import check_json
 from dnnmso_mj.log.messages import Messages
 from dnnmso_mj.log.prefix import Prefix, Record
-from dnnmso_mj.log.step_message import StepFormat, check_schema, layout_of
+from dnnmso_mj.log.rows import Kept, Rows, Take
+from dnnmso_mj.log.step_message import check_schema
 from dnnmso_mj.scenario import Scenario
-from dnnmso_mj.trace import Event, RunInfo
+from dnnmso_mj.trace import Event, RunInfo, Trace
 
 Array = np.ndarray
-
-
-class Steps:
-    """The rows of a log, made of its messages as they come."""
-
-    def __init__(self) -> None:
-        self._format: StepFormat | None = None
-        self._data = bytearray()  # grows in place: a long log is in memory once
-        self._count = 0
-
-    def add(self, messages: Messages) -> None:
-        """Take the next messages.
-
-        Raises:
-            ValueError: one is no `dnnmso.Step`, or unlike the first.
-        """
-        if self._format is None:
-            self._format = StepFormat(layout_of(messages.data[0].tobytes()))
-        self._data += self._format.decode(messages.data, self._count).tobytes()
-        self._count += len(messages)
-
-    def columns(self) -> dict[str, Array] | None:
-        """The columns so far; None without a message."""
-        if self._format is None:
-            return None
-        layout = self._format.layout
-        return layout.columns(np.frombuffer(self._data).reshape(-1, layout.width))
 
 
 @dataclass
@@ -55,7 +30,7 @@ class Scan:
 
     path: Path
     size: int
-    add_steps: Callable[[Messages], None] | None
+    take: Take | None = None
     complete: bool = False
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -64,6 +39,8 @@ class Scan:
     attachments: dict[str, int] = field(default_factory=dict)
     events: list[Event] = field(default_factory=list)
     ticks: int = 0
+    _event_bytes: int = 0
+    _rows: Rows | None = None
 
     def error(self, problem: str) -> LogError:
         return LogError(f"{self.path}: {problem}.")
@@ -83,21 +60,28 @@ class Scan:
                 self.attachments[record.name] = len(record.data)
 
     def _add_messages(self, messages: Messages) -> None:
-        channel = self.channels.get(messages.channel_id)
-        if channel is None:  # the format forbids it
-            return
+        channel = self.channels[messages.channel_id]
         self.counts[channel.topic] += len(messages)
         if channel.topic == STEP.name:
             if not self.ticks:
                 self._check_schema(channel)
             self.ticks += len(messages)
         try:
-            if channel.topic == STEP.name and self.add_steps is not None:
-                self.add_steps(messages)
+            if channel.topic == STEP.name and self.take is not None:
+                self._rows = self._rows or Rows(self.scenario(), self.size)
+                for layout, rows in self._rows.decode(messages):
+                    self.take(layout, rows)
             elif channel.topic == EVENTS.name:
-                self.events += [event_of(message.tobytes()) for message in messages.data]
+                self._add_events(messages.data)
         except ValueError as error:
             raise self.error(f"{channel.topic}: {error}. Run the scenario again") from error
+
+    def _add_events(self, data: Array) -> None:
+        self._event_bytes += len(data) * (limits.EVENT + data.shape[1])
+        most = limits.events(self.size)
+        if self._event_bytes > most:
+            raise limits.too_much(self.path, "bytes of events", most, self.size)
+        self.events += [event_of(message.tobytes()) for message in data]
 
     def check(self) -> None:
         """Refuse a log that is not ours.
@@ -105,11 +89,7 @@ class Scan:
         Raises:
             LogError: it has no scenario, or no channel /step of ours.
         """
-        if "json" not in self.metadata.get("scenario", {}):
-            raise self.error(
-                "no metadata record 'scenario': an MCAP of another program, or a run killed "
-                "before its log began. Logs are what `dnnmso run` writes"
-            )
+        self._scenario_text()
         step = next((c for c in self.channels.values() if c.topic == STEP.name), None)
         if step is None:
             topics = ", ".join(sorted(c.topic for c in self.channels.values())) or "none"
@@ -132,8 +112,13 @@ class Scan:
             raise self.error(f"{error}. Read it with {self._writer()}") from error
 
     def scenario(self) -> Scenario:
+        text = self._scenario_text()
         try:
-            return Scenario.model_validate_json(self.metadata["scenario"]["json"])
+            check_json(text)
+        except ValueError as error:
+            raise self.error(f"its scenario is {error}. Run the scenario again") from error
+        try:
+            return Scenario.model_validate_json(text)
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"])) or "the text"
@@ -149,21 +134,60 @@ class Scan:
             raise self.error(f"a metadata record is damaged: {error}. Run it again") from error
         return info if self.complete else replace(info, status="unfinished")
 
+    def trace(self, columns: dict[str, Array] | None) -> Trace:
+        """The log as a trace of these columns.
+
+        Raises:
+            LogError: there is none.
+        """
+        if columns is None:
+            raise self.error("holds no tick: the run ended before its first. Run it again")
+        return Trace(columns, self.scenario(), self.run(), tuple(self.events))
+
+    def _scenario_text(self) -> str:
+        text = self.metadata.get("scenario", {}).get("json")
+        if text is None:
+            raise self.error(
+                "no metadata record 'scenario': an MCAP of another program, or a run killed "
+                "before its log began. Logs are what `dnnmso run` writes"
+            )
+        return text
+
     def _writer(self) -> str:
         """The program that wrote the log, as far as it says."""
         return f"dnnmso_mj {self.metadata.get('versions', {}).get('dnnmso_mj', 'of its time')}"
 
 
-def scan(path: Path, steps: Callable[[Messages], None] | None = None) -> Scan:
-    """Read a log once, complete or torn; `steps` takes the messages on /step.
+def scan(
+    path: Path, take: Take | None = None, files: Callable[[Attachment], None] | None = None
+) -> Scan:
+    """Read a log once, complete or torn.
+
+    Args:
+        path: the file.
+        take: takes the rows of its ticks.
+        files: takes the attachments.
 
     Raises:
         LogError: the file is no log of this package.
     """
     prefix = Prefix(path)
-    log = Scan(path, prefix.size, steps)
+    log = Scan(path, prefix.size, take)
     for record in prefix:
         log.add(record)
+        if files is not None and isinstance(record, Attachment):
+            files(record)
     log.complete = prefix.complete
     log.check()
     return log
+
+
+def scan_trace(path: Path, files: Callable[[Attachment], None] | None = None) -> tuple[Scan, Trace]:
+    """Read a log once, with all of its ticks.
+
+    Raises:
+        LogError: the file is no log of this package, or holds not one tick.
+    """
+    kept = Kept(Prefix(path).size)
+    log = scan(path, kept.add, files)
+    return log, log.trace(kept.columns())

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from dnnmso_mj.log.format import MODEL
+from dnnmso_mj.log.json_texts import read_json
 from dnnmso_mj.scenario import Scenario
 
 SEGMENTS, RESUMED = "segments", "resumed"  # metadata records
@@ -48,14 +49,21 @@ def read_segments(records: Mapping[str, Mapping[str, str]], scenario: Scenario) 
     if SEGMENTS not in records:
         return [Segment(0, scenario)]
     try:
-        return [
+        segments = [
             Segment(
                 first=int(row["first"]),
                 scenario=Scenario.model_validate_json(json.dumps(row["scenario"])),
                 model=str(row["model"]),
                 told=str(row["told"]),
             )
-            for row in json.loads(records[SEGMENTS]["json"])
+            for row in read_json(records[SEGMENTS]["json"])
         ]
-    except (ValueError, KeyError, TypeError) as error:  # pydantic's is a ValueError
+    except (ValueError, KeyError, TypeError, OverflowError) as error:  # pydantic's is a ValueError
         raise ValueError(f"its record {SEGMENTS!r} is not one of this version") from error
+    firsts = [part.first for part in segments]
+    fitting = all(
+        (s.scenario.dt, s.scenario.n_joints) == (scenario.dt, scenario.n_joints) for s in segments
+    )
+    if not fitting or firsts[:1] != [0] or firsts != sorted(set(firsts)):
+        raise ValueError(f"its record {SEGMENTS!r} has parts of another robot, or out of order")
+    return segments

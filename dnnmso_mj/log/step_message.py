@@ -16,6 +16,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
 
+from dnnmso_mj.log import limits
 from dnnmso_mj.trace import FLAGS, SCALARS, StepLayout
 
 Array = np.ndarray
@@ -79,6 +80,7 @@ class StepFormat:
 
     def __init__(self, layout: StepLayout) -> None:
         self.layout = layout
+        self.odd = 0  # messages that were packed otherwise and decoded one by one
         template = bytearray()
         offsets: list[int] = []
         values = np.zeros(0, dtype=bool)  # which bytes of a message hold numbers
@@ -128,6 +130,7 @@ class StepFormat:
         if self._are_ours(messages):
             rows.view(self._row)[:, 0] = messages.view(self._record)[:, 0]
         else:
+            self.odd += len(messages)
             for k, message in enumerate(messages):
                 rows[k] = self._parse(message.tobytes(), first + k)
         return rows
@@ -159,12 +162,18 @@ def layout_of(message: bytes) -> StepLayout:
     """The layout of a log, from the widths in its first message.
 
     Raises:
-        ValueError: the bytes are no `dnnmso.Step`, or one without a joint.
+        ValueError: the bytes are no `dnnmso.Step`, or one without a joint or with far too many.
     """
     first = _parsed(message, 0)
     if not first.q:
         raise ValueError("message 0 has no joint angle in q; expected one a joint")
-    return StepLayout(n_joints=len(first.q), n_layers=len(first.weight_norm))
+    joints, layers = len(first.q), len(first.weight_norm)
+    if joints > limits.JOINTS or layers > limits.LAYERS:
+        raise ValueError(
+            f"message 0 has {joints} joints and {layers} layers; allowed: {limits.JOINTS} and "
+            f"{limits.LAYERS}"
+        )
+    return StepLayout(n_joints=joints, n_layers=layers)
 
 
 def _message_class() -> type[Message]:

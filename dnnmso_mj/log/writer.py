@@ -38,6 +38,7 @@ from mcap.writer import MCAP0_MAGIC
 from dnnmso_mj import __version__
 from dnnmso_mj.log.messages import HEADER_SIZE, RECORD, Messages, pack, pack_one
 
+_INDEXES = (Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 CHUNK_BYTES = 64 * 1024  # small enough to be compressed within a control period
 
 
@@ -60,9 +61,11 @@ class LogWriter:
         self._chunk_size = 0
         self._index: dict[int, list[bytes]] = defaultdict(list)  # channel -> times and places
         self._span: tuple[int, int] | None = None  # ns, of the chunk
-        self._chunk_indexes: list[ChunkIndex] = []
-        self._attachment_indexes: list[AttachmentIndex] = []
-        self._metadata_indexes: list[MetadataIndex] = []
+        self._indexes = {
+            opcode: bytearray() for opcode in _INDEXES
+        }  # as bytes: they grow with a run
+        self._indexed = dict.fromkeys(_INDEXES, 0)
+        self._logged: tuple[int, int] | None = None  # ns, of all chunks
         self._counts: dict[int, int] = defaultdict(int)  # channel -> messages
         self._put(MCAP0_MAGIC)
         self._put(_bytes(Header(profile="", library=f"dnnmso_mj {__version__}")))
@@ -107,14 +110,14 @@ class LogWriter:
         """Write a file that belongs to the log, as of a time (ns)."""
         record = _bytes(Attachment(time_ns, time_ns, name, media_type, data))
         place, size = self._put(record)
-        self._attachment_indexes.append(
-            AttachmentIndex(place, size, time_ns, time_ns, len(data), name, media_type)
-        )
+        index = AttachmentIndex(place, size, time_ns, time_ns, len(data), name, media_type)
+        self._add_index(Opcode.ATTACHMENT_INDEX, index)
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
         """Write names and values."""
         place, size = self._put(_bytes(Metadata(name=name, metadata=data)))
-        self._metadata_indexes.append(MetadataIndex(offset=place, length=size, name=name))
+        index = MetadataIndex(offset=place, length=size, name=name)
+        self._add_index(Opcode.METADATA_INDEX, index)
 
     def flush(self) -> None:
         """End the chunk in progress, and hand everything to the operating system."""
@@ -126,17 +129,14 @@ class LogWriter:
         self._end_chunk()
         self._put(_bytes(DataEnd(self._crc)))
         start = self._size
-        groups = (
-            (Opcode.SCHEMA, self._schemas),
-            (Opcode.CHANNEL, self._channels),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self._chunk_indexes),
-            (Opcode.ATTACHMENT_INDEX, self._attachment_indexes),
-            (Opcode.METADATA_INDEX, self._metadata_indexes),
-        )
-        summary, offsets = b"", b""
-        for opcode, records in groups:
-            group = b"".join(map(_bytes, records))
+        groups: dict[Opcode, bytes | bytearray] = {
+            Opcode.SCHEMA: b"".join(map(_bytes, self._schemas)),
+            Opcode.CHANNEL: b"".join(map(_bytes, self._channels)),
+            Opcode.STATISTICS: _bytes(self._statistics()),
+            **self._indexes,
+        }
+        summary, offsets = bytearray(), b""
+        for opcode, group in groups.items():
             if group:
                 offsets += _bytes(SummaryOffset(opcode, start + len(summary), len(group)))
                 summary += group
@@ -146,7 +146,7 @@ class LogWriter:
         summary += offsets
         # The footer's checksum covers the footer itself up to the checksum.
         footer.summary_crc = zlib.crc32(summary + _bytes(footer)[:-4])
-        self._put(summary + _bytes(footer) + MCAP0_MAGIC)
+        self._put(bytes(summary) + _bytes(footer) + MCAP0_MAGIC)
         self._file.flush()
 
     def _put(self, data: bytes) -> tuple[int, int]:
@@ -185,33 +185,38 @@ class LogWriter:
         )
         place, size = self._put(_bytes(chunk))
         offsets = {id: self._put(_message_index(id, at))[0] for id, at in self._index.items()}
-        self._chunk_indexes.append(
-            ChunkIndex(
-                chunk_length=size,
-                chunk_start_offset=place,
-                compression=chunk.compression,
-                compressed_size=len(chunk.data),
-                message_end_time=end,
-                message_index_length=self._size - place - size,
-                message_index_offsets=offsets,
-                message_start_time=start,
-                uncompressed_size=len(content),
-            )
+        index = ChunkIndex(
+            chunk_length=size,
+            chunk_start_offset=place,
+            compression=chunk.compression,
+            compressed_size=len(chunk.data),
+            message_end_time=end,
+            message_index_length=self._size - place - size,
+            message_index_offsets=offsets,
+            message_start_time=start,
+            uncompressed_size=len(content),
         )
+        self._add_index(Opcode.CHUNK_INDEX, index)
+        first, last = self._logged or (start, end)
+        self._logged = min(first, start), max(last, end)
         self._chunk, self._chunk_size, self._span = [], 0, None
         self._index.clear()
 
+    def _add_index(self, opcode: Opcode, record: McapRecord) -> None:
+        self._indexes[opcode] += _bytes(record)
+        self._indexed[opcode] += 1
+
     def _statistics(self) -> Statistics:
-        chunks = self._chunk_indexes
+        start, end = self._logged or (0, 0)
         return Statistics(
-            attachment_count=len(self._attachment_indexes),
+            attachment_count=self._indexed[Opcode.ATTACHMENT_INDEX],
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
-            chunk_count=len(chunks),
+            chunk_count=self._indexed[Opcode.CHUNK_INDEX],
             message_count=sum(self._counts.values()),
-            message_end_time=max((chunk.message_end_time for chunk in chunks), default=0),
-            message_start_time=min((chunk.message_start_time for chunk in chunks), default=0),
-            metadata_count=len(self._metadata_indexes),
+            message_end_time=end,
+            message_start_time=start,
+            metadata_count=self._indexed[Opcode.METADATA_INDEX],
             schema_count=len(self._schemas),
         )
 

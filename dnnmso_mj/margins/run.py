@@ -19,7 +19,7 @@ from dnnmso_mj.sweep.journal import Journal
 from dnnmso_mj.sweep.local import LocalEngine
 from dnnmso_mj.sweep.plan import seeds_text
 from dnnmso_mj.sweep.run import Watcher, complete, refuse_both
-from dnnmso_mj.sweep.table import Kind, write_table
+from dnnmso_mj.sweep.table import Kind
 
 METADATA_KEY = b"dnnmso_margins"
 ROW_SCHEMA = pa.schema(
@@ -103,8 +103,7 @@ def run_margins(
         )
         provenance = _provenance(plan, command)
         table = _finished(rows, plan, provenance)
-        write_table(table, out)
-        journal.remove()
+        journal.publish(table)
     return MarginResult(out, table, provenance, kept, time.perf_counter() - started, engine.jobs)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -12,6 +11,8 @@ from typing import Any
 
 from dnnmso_mj.errors import DnnmsoError
 from dnnmso_mj.files import write_whole
+from dnnmso_mj.log.json_texts import read_json
+from dnnmso_mj.log.opening import open_regular
 from dnnmso_mj.report.page import Section, render
 from dnnmso_mj.wording import clean
 
@@ -58,7 +59,8 @@ def _section(file: Path) -> Section:
     """What one file says, told apart by what it holds, not by its name."""
     name = clean(str(file))
     try:
-        with file.open("rb") as stream:
+        stream, _ = open_regular(file)
+        with stream:
             beginning = stream.read(len(MCAP))
             stream.seek(0)
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -76,16 +78,18 @@ def _section(file: Path) -> Section:
 
 
 def _table_section(file: Path, name: str) -> Section:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    from dnnmso_mj.sweep.parquet import TableError, read_parquet
+    from dnnmso_mj.sweep.table import LARGEST
 
     try:
-        table = pq.read_table(file)
+        table = read_parquet(file)
         metadata = table.schema.metadata or {}
         for key, make in _makers().items():
             if key in metadata:
-                return make(table, json.loads(metadata[key]))
-    except (pa.ArrowException, LookupError, TypeError, ValueError, AttributeError) as error:
+                return make(table, read_json(metadata[key].decode(), LARGEST))
+    except TableError as error:
+        raise ReportError(f"{name}: damaged: {clean(str(error))}; allowed: {KINDS}") from error
+    except (ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as error:
         problem = f"damaged: {type(error).__name__}: {clean(str(error))}"
         raise ReportError(f"{name}: {problem}; allowed: {KINDS}") from error
     raise ReportError(f"{name}: a table that no command of dnnmso wrote; allowed: {KINDS}")

@@ -23,7 +23,11 @@ METRICS: Mapping[str, tuple[str, str]] = {
         "When the error enters for good a band of 2 % of its largest value in the first half.",
     ),
     "bound_violations": ("ticks", "Ticks at which the error exceeds its theoretical bound."),
-    "diverged": ("", "Whether the run was stopped because it left the plausible range."),
+    "diverged": (
+        "",
+        "Whether the run was stopped because it left the plausible range or a limit of its joints; "
+        "it has no means, steady values or settling time then.",
+    ),
     "compute_us_p50": ("µs", "Median of the controller's time a tick."),
     "compute_us_p999": ("µs", "99.9th percentile of the controller's time a tick."),
     "deadline_misses": ("ticks", "Ticks without a command in time."),

@@ -41,6 +41,7 @@ from dnnmso_mj.scenario.optimizers import Adam, ByMadam, Madam, Rule, Sgd, SignS
 from dnnmso_mj.scenario.policy import Policy
 from dnnmso_mj.scenario.replay import DnnMsoReplay, KnownDelay
 from dnnmso_mj.scenario.rivals import L1, Adrc, ComputedTorque, Pd, Pid, Rise, SlidingMode
+from dnnmso_mj.scenario.safety import Safety
 
 __all__ = [
     "L1",
@@ -85,6 +86,7 @@ __all__ = [
     "Reference",
     "Rise",
     "Rule",
+    "Safety",
     "Scenario",
     "Setpoint",
     "Sgd",
@@ -259,6 +261,8 @@ class Scenario(Strict):
     """What separates it from a robot; nothing unless given."""
     events: Annotated[tuple[Event, ...], BeforeValidator(as_tuple)] = ()
     """What happens at set times."""
+    safety: Safety = Safety()
+    """What stops the arm; nothing unless given."""
     real_time: RealTime = RealTime()
     """What happens when the wall clock is not kept."""
 

@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.json
 
 from dnnmso_mj.sweep.plan import SweepError, seeds_text
-from dnnmso_mj.sweep.table import SWEEP, Kind, is_table, read_table, unfinished_rows
+from dnnmso_mj.sweep.table import SWEEP, Kind, is_table, read_table, unfinished_rows, write_table
 from dnnmso_mj.sweep.task import Row
 from dnnmso_mj.wording import show
 
@@ -81,6 +81,7 @@ class Journal:
         self.out, self._plan, self._kind = out, plan, kind
         self._path = journal_path(out)
         self._synced = time.monotonic()
+        self._replaces = out.exists()
         self.done: list[set[int]] = [set() for _ in plan.points]
         if out.exists() and not is_table(out, kind):
             _refuse_foreign(out, f"a table of `{kind.command}`")
@@ -144,6 +145,15 @@ class Journal:
                 return table.select(schema.names).cast(schema)
         except (OSError, pa.ArrowException, ValueError) as error:
             self._damaged(error)
+
+    def publish(self, table: pa.Table) -> None:
+        """Write the finished table, and nothing over what has come to its place meanwhile.
+
+        Raises:
+            SweepError: it cannot be written; its rows are still here.
+        """
+        write_table(table, self.out, replace=self._replaces)
+        self.remove()
 
     def remove(self) -> None:
         """Delete the file; its rows are in the table now, or there are none."""

@@ -103,6 +103,7 @@ class WorkerPool:
         self._rest: deque[Work] = deque()  # of tasks whose process died
         self._again: deque[Work] = deque()  # runs that were under way when it did
         self._suspects: set[tuple[int, int]] = set()
+        self._stillborn = 0
 
     def _listen(self, worker: _Worker) -> Iterator[Row]:
         """Take one message, or the end, of a worker; give it more to do when it is done."""
@@ -148,6 +149,11 @@ class WorkerPool:
     def _bury(self, worker: _Worker) -> Iterator[Row]:
         """Account for the runs of a worker that died."""
         how = worker.cause_of_death()
+        if not worker.ready and worker.killed and self._stillborn < self.jobs:
+            self._stillborn += 1  # somebody has ended it, or memory was short; once more
+            if worker.first is not None:
+                self._rest.append(worker.first)
+            return
         if not worker.ready:
             raise SweepError(f"a worker process cannot start: {how}; its own words stand above")
         culprit, *others = worker.seeds
@@ -196,6 +202,11 @@ class _Worker:
         self.pipe.close()
         self._process.kill()
         self._process.wait()
+
+    @property
+    def killed(self) -> bool:
+        """Whether it was ended by a signal, after its end of the pipe has closed."""
+        return self._process.wait() < 0
 
     def cause_of_death(self) -> str:
         """How the process ended, after its end of the pipe has closed."""

@@ -7,8 +7,9 @@ import os
 import socket
 import time
 from collections.abc import Generator, Iterable, Iterator
-from contextlib import chdir, contextmanager
+from contextlib import chdir, contextmanager, nullcontext
 from dataclasses import replace
+from ipaddress import ip_address
 from types import ModuleType
 from typing import Any
 
@@ -141,20 +142,52 @@ def _connected(ray: ModuleType, address: str | None, jobs: int | None) -> Iterat
         options |= {"address": "local", "num_cpus": jobs, "include_dashboard": False}
     else:
         options |= {"address": address}
-    try:
-        _check_reachable(address)
-        # Ray puts the folder of this moment first where its workers import from: let it be the one
-        # that this code came from, not whatever the caller stands in.
-        with chdir(PACKAGE.parent):
-            ray.init(**options)
-    except (OSError, ValueError, RuntimeError) as error:
-        where = "this machine" if address is None else f"--address {clean(address)}"
-        start = "allowed: auto or HOST:PORT of a cluster that `ray start --head` has started"
-        raise SweepError(f"{where}: no Ray there: {clean(str(error))}; {start}") from error
+    with _on_loopback(ray) if address is None else nullcontext():
+        try:
+            _check_reachable(address)
+            # Ray puts the folder of this moment first where its workers import from: let it be the
+            # one that this code came from, not whatever the caller stands in.
+            with chdir(PACKAGE.parent):
+                ray.init(**options)
+        except Exception as error:  # of no kind of its own where its processes start too slowly
+            where = "this machine" if address is None else f"--address {clean(address)}"
+            start = "allowed: auto or HOST:PORT of a cluster that `ray start --head` has started"
+            raise SweepError(f"{where}: no Ray there: {clean(str(error))}; {start}") from error
+        try:
+            if address is None:
+                _check_alone(ray.util.get_node_ip_address())
+            yield
+        finally:
+            ray.shutdown()
+
+
+@contextmanager
+def _on_loopback(ray: ModuleType) -> Iterator[None]:
+    """Ray that is started inside listens on 127.0.0.1 alone.
+
+    Left to itself it takes the whole network's orders, without a password, and an address that it
+    is given it replaces, unless it takes this machine for one that has no clusters. The variable
+    is for its processes; for this one it may come too late.
+    """
+    constants = ray._private.ray_constants
+    variable = constants.ENABLE_RAY_CLUSTERS_ENV_VAR
+    before = os.environ.get(variable), constants.ENABLE_RAY_CLUSTER
+    os.environ[variable], constants.ENABLE_RAY_CLUSTER = "0", False
     try:
         yield
     finally:
-        ray.shutdown()
+        os.environ.pop(variable)
+        if before[0] is not None:
+            os.environ[variable] = before[0]
+        constants.ENABLE_RAY_CLUSTER = before[1]
+
+
+def _check_alone(host: str) -> None:
+    if not ip_address(host).is_loopback:
+        raise SweepError(
+            f"Ray listens on {host}, where others reach it; allowed: 127.0.0.1. "
+            "Use --engine local, or another version of Ray"
+        )
 
 
 def _check_reachable(address: str | None) -> None:

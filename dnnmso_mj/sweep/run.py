@@ -16,7 +16,7 @@ from dnnmso_mj.provenance import software_versions
 from dnnmso_mj.sweep.journal import Journal
 from dnnmso_mj.sweep.local import LocalEngine
 from dnnmso_mj.sweep.plan import Plan, SweepError, seeds_text
-from dnnmso_mj.sweep.table import finished_table, write_table
+from dnnmso_mj.sweep.table import finished_table
 from dnnmso_mj.sweep.task import Row, Task
 from dnnmso_mj.wording import show
 
@@ -133,8 +133,7 @@ def run_sweep(
             journal, plan.n_runs, lambda: engine.rows(plan.tasks(journal.done)), watcher
         )
         table = finished_table(rows, plan, _provenance(plan, engine, command))
-        write_table(table, out)
-        journal.remove()
+        journal.publish(table)
     wall_s = time.perf_counter() - started
     return SweepResult(out, table, kept, ticks, wall_s, engine.jobs)
 

@@ -51,8 +51,8 @@ class PointSummary:
 def summarise(table: pa.Table, plan: Plan) -> list[PointSummary]:
     """The finished table of a plan, point by point.
 
-    Rows of runs that diverged or failed are counted and listed, never averaged: their metrics speak
-    of the part that was run. No seed is left out for any other reason.
+    Rows of runs that diverged or failed are counted and listed, never averaged: what they have of
+    metrics speaks of the part that was run. No seed is left out for any other reason.
     """
     size = len(plan.seeds)
     return [

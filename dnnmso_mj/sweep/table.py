@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +11,13 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from dnnmso_mj.files import whole_file
+from dnnmso_mj.log.json_texts import read_json
+from dnnmso_mj.sweep.parquet import TableError, read_parquet, write_parquet
 from dnnmso_mj.sweep.plan import Plan, SweepError
 
 METADATA_KEY = b"dnnmso_sweep"
+LARGEST = 1 << 24  # characters of a provenance, which has a scenario for each point
 
 
 @dataclass(frozen=True)
@@ -85,23 +88,26 @@ def finished_table(rows: pa.Table, plan: Plan, provenance: dict[str, Any]) -> pa
     return pa.table(columns, schema=pa.schema(fields, metadata={METADATA_KEY: text}))
 
 
-def write_table(table: pa.Table, out: Path) -> None:
+def write_table(table: pa.Table, out: Path, *, replace: bool = True) -> None:
     """Write Parquet: whole under its name, or not at all.
 
+    Args:
+        table: what is written.
+        out: the file.
+        replace: whether it may take the place of another one.
+
     Raises:
-        SweepError: the file cannot be written.
+        SweepError: the file cannot be written, or is there and may not be replaced.
     """
-    unfinished = out.with_name(f".{out.name}.tmp")
     try:
-        with unfinished.open("wb") as stream:
-            pq.write_table(table, stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        unfinished.replace(out)
-    except BaseException as error:
-        unfinished.unlink(missing_ok=True)
-        if not isinstance(error, OSError):
-            raise
+        with whole_file(out, replace=replace, sync=True) as file:
+            write_parquet(table, file)
+    except FileExistsError as error:
+        raise SweepError(
+            f"{out}: has been made by something else meanwhile, and nothing is written over it; "
+            f"the rows are kept beside it; allowed: move it away, then --resume"
+        ) from error
+    except OSError as error:
         raise SweepError(f"{out}: cannot be written: {error.strerror or error}") from error
 
 
@@ -112,9 +118,9 @@ def read_table(path: Path, kind: Kind = SWEEP) -> tuple[pa.Table, dict[str, Any]
         SweepError: not a table of this kind.
     """
     try:
-        table = pq.read_table(path)
-        return table, json.loads(table.schema.metadata[kind.key])
-    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
+        table = read_parquet(path)
+        return table, read_json(table.schema.metadata[kind.key].decode(), LARGEST)
+    except (OSError, TableError, KeyError, TypeError, ValueError) as error:
         raise SweepError(f"{path}: not a table of `{kind.command}`: {error}") from error
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self
@@ -105,6 +105,11 @@ class Study:
 
     def ask(self) -> tuple[optuna.Trial, Values]:
         """Begin a trial: what to tell the value to, and what to try."""
+        with _writing(self._path):
+            trial = self._asked()
+        return trial, self._rounded(trial.params)
+
+    def _asked(self) -> optuna.Trial:
         optuna, done = self._optuna, self.n_done
         self._study.sampler = optuna.samplers.TPESampler(
             seed=SAMPLER_SEED + done, multivariate=True
@@ -112,16 +117,16 @@ class Study:
         states = (optuna.trial.TrialState.WAITING,)
         if done == 0 and not self._study.get_trials(deepcopy=False, states=states):
             self._study.enqueue_trial(dict(self._start))
-        trial = self._study.ask({
+        return self._study.ask({
             path: optuna.distributions.FloatDistribution(reach.low, reach.high, log=reach.log)
             for path, reach in self._space.items()
         })  # fmt: skip
-        return trial, self._rounded(trial.params)
 
     def tell(self, trial: optuna.Trial, value: float | None) -> None:
         """Keep a trial's value; None: it was interrupted, and does not count."""
         state = self._optuna.trial.TrialState.FAIL if value is None else None
-        self._study.tell(trial, value, state=state)
+        with _writing(self._path):
+            self._study.tell(trial, value, state=state)
 
     def _done(self) -> list[optuna.trial.FrozenTrial]:
         complete = (self._optuna.trial.TrialState.COMPLETE,)
@@ -143,8 +148,11 @@ class Study:
         return storage
 
     def _new(self, name: str, definition: dict[str, Any]) -> optuna.Study:
-        study: optuna.Study = self._optuna.create_study(storage=self._storage(), study_name=name)
-        study.set_user_attr(ATTRIBUTE, json.dumps(definition))
+        with _writing(self._path):
+            study: optuna.Study = self._optuna.create_study(
+                storage=self._storage(), study_name=name
+            )
+            study.set_user_attr(ATTRIBUTE, json.dumps(definition))
         return study
 
     def _open(self) -> optuna.Study:
@@ -162,8 +170,9 @@ class Study:
                 "over it; allowed: another --storage, or remove it first"
             )
         state = self._optuna.trial.TrialState
-        for trial in study.get_trials(deepcopy=False, states=(state.RUNNING,)):
-            study.tell(trial.number, state=state.FAIL)
+        with _writing(self._path):
+            for trial in study.get_trials(deepcopy=False, states=(state.RUNNING,)):
+                study.tell(trial.number, state=state.FAIL)
         return study
 
     def _check(self, definition: dict[str, Any]) -> None:
@@ -194,6 +203,22 @@ def import_optuna() -> ModuleType:
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     module: ModuleType = optuna
     return module
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """A database that cannot be written is one error, not the library's many."""
+    from optuna.exceptions import StorageInternalError
+    from sqlalchemy.exc import SQLAlchemyError
+
+    try:
+        yield
+    except (OSError, SQLAlchemyError, StorageInternalError) as error:
+        cause = getattr(error, "orig", None) or error.__cause__ or error
+        why = str(getattr(cause, "orig", None) or cause).splitlines()[0]
+        raise TuneError(
+            f"{path}: cannot be written: {why}; finished trials are kept; --resume goes on"
+        ) from error
 
 
 def _has_studies(path: Path) -> bool:

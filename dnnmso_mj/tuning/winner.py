@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from ruamel.yaml import YAML
 from ruamel.yaml.representer import RoundTripRepresenter
 
 from dnnmso_mj.errors import ScenarioError
+from dnnmso_mj.files import whole_file
 from dnnmso_mj.loading.tuned import read_tuned
 from dnnmso_mj.scenario import Controller
 from dnnmso_mj.scenario.tuned import Tuning
@@ -62,18 +62,11 @@ def write_tuned(out: Path, controller: Controller, tuning: Tuning) -> None:
     yaml.Representer = _Plain
     yaml.width = 10_000  # long texts stay on their line
     whole = {"controller": controller.model_dump(mode="json"), "tuning": tuning.model_dump()}
-    unfinished = out.with_name(f".{out.name}.tmp")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with unfinished.open("w", encoding="utf-8") as stream:
-            stream.write(HEAD)
-            yaml.dump(whole, stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        read_tuned(unfinished)
-        unfinished.replace(out)
-    except BaseException as error:
-        unfinished.unlink(missing_ok=True)
-        if not isinstance(error, OSError):
-            raise
+        with whole_file(out, sync=True) as file:
+            file.write(HEAD.encode())
+            yaml.dump(whole, file)
+            file.flush()
+            read_tuned(Path(file.name))
+    except OSError as error:
         raise TuneError(f"{out}: cannot be written: {error.strerror or error}") from error

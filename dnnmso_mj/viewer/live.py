@@ -7,7 +7,6 @@ Rerun takes, and waits for the viewer. So no viewer, however slow, stopped or go
 from __future__ import annotations
 
 import os
-import pickle
 import subprocess
 import sys
 import tempfile
@@ -27,6 +26,7 @@ from dnnmso_mj.scene import Scene
 from dnnmso_mj.sources import python_path
 from dnnmso_mj.trace import Event, RunInfo, StepLayout
 from dnnmso_mj.viewer.process import (
+    LOCAL,
     RerunProcess,
     check_display,
     data_address,
@@ -37,6 +37,7 @@ from dnnmso_mj.viewer.process import (
 )
 from dnnmso_mj.viewer.ring import Ring, shared_memory
 from dnnmso_mj.viewer.web import web_server
+from dnnmso_mj.viewer.wire import ending, event_bytes, opening, snapshot_bytes
 
 Array = np.ndarray
 Control: TypeAlias = "Connection[Any, Any]"
@@ -78,10 +79,10 @@ class LiveView:
         """
         self._ring.warm(8 * layout.width * scenario.n_ticks)
         try:
-            self._control.send((scenario, scene, layout))
+            self._control.send_bytes(opening(scenario, scene, layout))
             if not self._control.poll(_START_S):
                 raise DnnmsoError(f"the live view was not ready after {_START_S:g} s. Try again.")
-            self._control.recv()
+            self._control.recv_bytes()
         except (EOFError, OSError) as error:
             why = self._process.complaint()
             raise DnnmsoError(f"the live view cannot start: {why}") from error
@@ -93,12 +94,12 @@ class LiveView:
 
     def event(self, event: Event) -> None:
         """Take an event."""
-        self._ring.put(EVENT, pickle.dumps(event))
+        self._ring.put(EVENT, event_bytes(event))
 
     def snapshot(self, name: str, t: float, arrays: Mapping[str, Array]) -> None:
         """Take the controller's state at time t (s); other snapshots are for logs."""
         if name == "controller":
-            self._ring.put(SNAPSHOT, pickle.dumps((t, dict(arrays))))
+            self._ring.put(SNAPSHOT, snapshot_bytes(t, arrays))
 
     def end(self, info: RunInfo) -> None:
         """Tell how the run went; wait until the viewer has got it all, or takes no more."""
@@ -111,12 +112,12 @@ class LiveView:
     def _deliver(self, info: RunInfo) -> str:
         """Have all that waits brought to the viewer; says why it may not have got everything."""
         with suppress(EOFError, OSError):
-            self._control.send(info)
+            self._control.send_bytes(ending(info))
             delivered = -1
             while delivered < self._ring.tally:
                 delivered = self._ring.tally
                 if self._control.poll(_PATIENCE_S):
-                    self._control.recv()  # "done"
+                    self._control.recv_bytes()  # "done"
                     break
             return "it took them too slowly, or not at all"
         return "it is gone" if self._ring.closed else self._process.complaint()
@@ -177,19 +178,25 @@ def window() -> Iterator[LiveView]:
 
 
 @contextmanager
-def served(port: int) -> Iterator[LiveView]:
-    """A view for browsers on this machine alone, also after the block, until Ctrl-C.
+def served(port: int, bind: str = LOCAL) -> Iterator[LiveView]:
+    """A view for browsers, also after the block, until Ctrl-C.
 
-    The page's address is printed on standard error.
+    The page's address is printed on standard error, and who reaches it beside this machine.
+
+    Args:
+        port: of the page.
+        bind: the IP address to listen on.
 
     Raises:
         DnnmsoError: the port is taken, or the server cannot start.
         MissingExtraError: rerun is not installed.
     """
     require("viewer", "the viewer")
-    with web_server(port) as server:
+    with web_server(port, bind=bind) as server:
         server.process.give_way()
         print(f"live     {server.page}", file=sys.stderr, flush=True)
+        if server.exposed:
+            print(server.exposed, file=sys.stderr, flush=True)
         with connected(server.data) as live:
             yield live
         print("The page stays until Ctrl-C.", file=sys.stderr, flush=True)

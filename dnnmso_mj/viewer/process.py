@@ -44,11 +44,15 @@ sys.exit(main())
 
 
 @contextlib.contextmanager
-def rerun(*arguments: str) -> Iterator[RerunProcess]:
-    """Run the command `rerun` with these arguments; end it, its children included, on leaving."""
+def rerun(*arguments: str, bind: str = LOCAL) -> Iterator[RerunProcess]:
+    """Run the command `rerun` with these arguments; end it, its children included, on leaving.
+
+    Args:
+        bind: the address that it listens on.
+    """
     with tempfile.TemporaryFile() as messages:
         process = subprocess.Popen(  # noqa: S603
-            [sys.executable, "-c", _RERUN, "--bind", LOCAL, *arguments],
+            [sys.executable, "-c", _RERUN, "--bind", bind, *arguments],
             # RERUN_APP_ONLY: no question about usage statistics at the first start.
             env={**os.environ, "RERUN_APP_ONLY": "true", "RUST_LOG": "error"},
             stdin=subprocess.PIPE,
@@ -224,35 +228,46 @@ def check_display(instead: str) -> None:
         raise DnnmsoError(f"no display: neither DISPLAY nor WAYLAND_DISPLAY is set. {instead}")
 
 
-def data_address(port: int) -> str:
-    """Where the viewer that listens at a port of this machine is streamed to."""
-    return f"rerun+http://{LOCAL}:{port}/proxy"
+def data_address(port: int, host: str = LOCAL) -> str:
+    """Where the viewer that listens at a port of a machine is streamed to."""
+    return f"rerun+http://{in_url(host)}:{port}/proxy"
 
 
-def free_port() -> int:
-    """A port of this machine that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind((LOCAL, 0))
+def in_url(host: str) -> str:
+    """An address as it stands in a URL."""
+    return f"[{host}]" if ":" in host else host
+
+
+def free_port(host: str = LOCAL) -> int:
+    """A port of an address of this machine that nobody listens on."""
+    with _probe(host) as probe:
+        probe.bind((host, 0))
         return int(probe.getsockname()[1])
 
 
-def listens(port: int) -> bool:
+def listens(port: int, host: str = LOCAL) -> bool:
     """Whether somebody listens on a port of this machine."""
-    with socket.socket() as probe:
-        return probe.connect_ex((LOCAL, port)) == 0
+    with _probe(host) as probe:
+        return probe.connect_ex((host, port)) == 0
 
 
-def check_port(port: int) -> None:
+def check_port(port: int, host: str = LOCAL) -> None:
     """Refuse a port that cannot be listened on.
 
     Raises:
-        DnnmsoError: it is taken, or not ours to take.
+        DnnmsoError: it is taken, or not ours to take; or the address is not this machine's.
     """
     try:
-        with socket.socket() as probe:
+        with _probe(host) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((LOCAL, port))
+            probe.bind((host, port))
     except (OSError, OverflowError) as error:
+        ours = "" if host == LOCAL else ", of an address of this machine"
         raise DnnmsoError(
-            f"port {port} of {LOCAL} cannot be used: {error}. Allowed: a free one, 1024 to 65535."
+            f"port {port} of {host} cannot be used: {error}. "
+            f"Allowed: a free one, 1024 to 65535{ours}."
         ) from error
+
+
+def _probe(host: str) -> socket.socket:
+    return socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)

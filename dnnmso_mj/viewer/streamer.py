@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import pickle
 import queue
 import sys
 import threading
@@ -24,6 +23,7 @@ from dnnmso_mj.viewer.live import EVENT, ROWS, SNAPSHOT, Control
 from dnnmso_mj.viewer.ring import Ring
 from dnnmso_mj.viewer.rrd import APPLICATION
 from dnnmso_mj.viewer.stream import RunStream
+from dnnmso_mj.viewer.wire import read_ending, read_event, read_opening, read_snapshot
 
 _LOOK_S = 0.2  # between two looks at the ring: each makes the viewer draw, beside the loop
 _BATCH_BYTES = 2 * 2**20  # sent at once: so small that the run's end sees each as a sign of life
@@ -35,12 +35,12 @@ def main() -> None:
     os.nice(_NICE)
     ring = Ring(int(sys.argv[1]))
     control: Control = Connection(int(sys.argv[2]))
-    scenario, scene, layout = control.recv()
+    scenario, scene, layout = read_opening(control.recv_bytes())
     recording = rr.RecordingStream(APPLICATION)
     stream = RunStream(recording, scenario, scene, layout)
     over: queue.SimpleQueue[RunInfo] = queue.SimpleQueue()
     threading.Thread(target=_follow, args=(control, over), daemon=True).start()
-    control.send("ready")
+    control.send_bytes(b"ready")
     # From here on the viewer is waited for, as long as it takes.
     recording.connect_grpc(sys.argv[3])
     stream.begin()
@@ -55,14 +55,14 @@ def main() -> None:
     stream.end(info)
     _deliver(recording, ring)
     recording.disconnect()
-    control.send("done")
+    control.send_bytes(b"done")
 
 
 def _follow(control: Control, over: queue.SimpleQueue[RunInfo]) -> None:
     """Pass on how the run went; end this process when the one that runs is gone."""
     with contextlib.suppress(EOFError, OSError):
         while True:
-            over.put(control.recv())
+            over.put(read_ending(control.recv_bytes()))
     os._exit(0)
 
 
@@ -84,12 +84,12 @@ def _send(
         rows = np.concatenate(blocks).reshape(-1, layout.width)
         unfinished = RunInfo("unfinished", scenario.seed)
         stream.send(Trace(layout.columns(rows), scenario, unfinished))
-    events = [pickle.loads(content) for kind, content in messages if kind == EVENT]  # noqa: S301
+    events = [read_event(content) for kind, content in messages if kind == EVENT]
     if events:
         stream.events(events)
     for kind, content in messages:
         if kind == SNAPSHOT:
-            stream.snapshot(*pickle.loads(content))  # noqa: S301
+            stream.snapshot(*read_snapshot(content))
     return len(rows) if blocks else 0
 
 
