@@ -111,7 +111,7 @@ def _mutate(part: Any, case: Any, folder: Path, seed: int) -> None:
         f"-seed={seed % 2**31 + 1}",  # 0 would mean any
         f"-max_len={part.MAX_LEN}",
         "-rss_limit_mb=4096",
-        "-timeout=0",  # `fuzzing` sees to that
+        "-timeout=1000000",  # `fuzzing` sees to that, and its alarm may kill
         "-reload=0",
         "-len_control=0",
         f"-artifact_prefix={folder}/",
