@@ -17,6 +17,9 @@ WORDS = {
 }
 
 
+RATE = 2  # of the flag `saturated`: what acts is the limit of the torque's rate
+
+
 class Changes:
     """Follows the flags of a run's rows.
 
@@ -25,35 +28,34 @@ class Changes:
         torque_limit: of the drives (N·m); without it, what limits a torque is its rate.
 
     Attributes:
-        flags: the last of each (2,), as bool.
+        flags: the last of each (2,), 0 where it is not set, else 1 or RATE.
     """
 
     def __init__(self, layout: StepLayout, torque_limit: tuple[float, ...] | None) -> None:
         self._most = expand(torque_limit or (np.inf,), layout.n_joints)
         self._torques = [layout.slices[name] for name in ("tau_cmd", "tau")]
-        self._rate = False  # whether what is acting is the limit of the rate
         self._columns = [layout.slices[name].start for name in WORDS]
-        self.flags: Array = np.zeros(len(WORDS), bool)
+        self.flags: Array = np.zeros(len(WORDS), np.int64)
 
     def events(self, rows: Array) -> Iterator[Event]:
         """What the next rows (m, width) change."""
-        for k, (column, (begins, ends)) in enumerate(
-            zip(self._columns, WORDS.values(), strict=True)
-        ):
+        for k, (column, words) in enumerate(zip(self._columns, WORDS.values(), strict=True)):
             flag = rows[:, column] != 0.0
-            if not (flag.any() or self.flags[k]):
-                continue
-            before = np.concatenate([self.flags[k : k + 1], flag[:-1]])
-            self.flags[k] = flag[-1]
+            before = np.concatenate([self.flags[k : k + 1] != 0, flag[:-1]])
             for i in np.flatnonzero(flag != before):
-                level, what = ("warning", begins) if flag[i] else ("info", ends)
-                if k == 0:
-                    what = self._named(rows[i], what, begins=bool(flag[i]))
-                yield Event(float(rows[i, 0]), level, what)
+                yield self._event(k, rows[i], words, begins=bool(flag[i]))
 
-    def _named(self, row: Array, what: str, *, begins: bool) -> str:
-        """The same words, of the limit that acts: that of the torque, or of its rate."""
+    def _event(self, k: int, row: Array, words: tuple[str, str], *, begins: bool) -> Event:
+        kind = self.flags[k]
         if begins:
-            asked, given = (np.abs(row[where]) for where in self._torques)
-            self._rate = bool((asked <= self._most).all() and (given < self._most).all())
-        return what.replace("torque limit", "torque rate limit") if self._rate else what
+            kind = RATE if k == 0 and self._is_of_rate(row) else 1
+        self.flags[k] = kind if begins else 0
+        what = words[0] if begins else words[1]
+        if kind == RATE:
+            what = what.replace("torque limit", "torque rate limit")
+        return Event(float(row[0]), "warning" if begins else "info", what)
+
+    def _is_of_rate(self, row: Array) -> bool:
+        """Whether a torque is limited that neither asks for more than there is, nor has it all."""
+        asked, given = (np.abs(row[where]) for where in self._torques)
+        return bool((asked <= self._most).all() and (given < self._most).all())

@@ -64,7 +64,7 @@ class LoggedRun:
             BLOCK,
         )
         whole = {name: np.concatenate([part[name] for part in parts]) for name in columns}
-        return self._same(_trace(scan, whole))
+        return self._same(scan.trace(whole))
 
     def drawn(self) -> Trace:
         """What figures need of it: of a long run the ticks that its outline is made of.
@@ -137,7 +137,7 @@ def read_drawn(log: Path) -> Trace:
 
 def _outline(log: Path, ticks: int) -> Trace:
     scan, columns = outline(log, ticks, _Drawn().signals, OUTLINE_BUCKETS)
-    return _trace(scan, columns)
+    return scan.trace(columns)
 
 
 class _Drawn:
@@ -173,10 +173,6 @@ def _lines(columns: Columns) -> Array:
     e_obs = np.linalg.norm(columns["e_obs"], axis=1)
     drawn = [error, worst, f_err, e_obs, *(columns[name] for name in (*names, *scalars))]
     return np.column_stack(drawn)
-
-
-def _trace(scan: Scan, columns: Columns) -> Trace:
-    return Trace(columns, scan.scenario(), scan.run(), tuple(scan.events))
 
 
 def _with_provenance(info: RunInfo, log: RunInfo) -> RunInfo:

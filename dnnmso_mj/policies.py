@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +13,13 @@ import numpy as np
 
 from dnnmso_mj.errors import MissingExtraError, ScenarioError
 from dnnmso_mj.external import called, import_callable, told
-from dnnmso_mj.files import digest
 from dnnmso_mj.scenario.policy import ONNX, Policy
 from dnnmso_mj.wording import clean, show
 
 Array = np.ndarray
 Act = Callable[[Array], Any]
 
+MAX_BYTES = 256 * 1024 * 1024  # of a file
 GROUP = "dnnmso_mj.policies"  # of entry points
 FLOATS = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 
@@ -40,9 +42,8 @@ class LoadedPolicy:
         zeros = np.zeros(n_inputs)
         if spec.file is not None:
             self.name = f"controller.file = {show(spec.file)}"
-            path = _found(spec, self.name)
-            load = _onnx if path.suffix in ONNX else _torchscript
-            self._act = load(path, self.name, zeros, n_outputs)
+            load = _onnx if Path(spec.file).suffix in ONNX else _torchscript
+            self._act = load(_read(spec, self.name), self.name, zeros, n_outputs)
         else:
             self.name = f"controller.python = {show(spec.python)}"
             self._act = self._owner = _python(spec, self.name)
@@ -81,21 +82,28 @@ class LoadedPolicy:
             self._owner.restore(state)
 
 
-def _found(spec: Policy, name: str) -> Path:
+def _read(spec: Policy, name: str) -> bytes:
+    """The file, which is the one that was meant; nothing is opened after it."""
     path = Path(spec.file or "")
     try:
-        found = digest(path)
+        if path.exists() and not path.is_file():
+            raise ValueError("not a regular file")
+        with path.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
     except (OSError, ValueError) as error:
         what = getattr(error, "strerror", None) or str(error)
         raise ScenarioError(
             f"{name}: {what}; allowed: a file of TorchScript (.pt, .ts) or ONNX (.onnx)"
         ) from error
+    if len(data) > MAX_BYTES:
+        raise ScenarioError(f"{name}: too large; allowed: {MAX_BYTES} bytes")
+    found = sha256(data).hexdigest()
     if spec.sha256 not in {None, found}:
         raise ScenarioError(
             f"controller.sha256 = {show(spec.sha256)}: {clean(str(path))} has {found}; allowed: "
             "the file that was meant, or null"
         )
-    return path
+    return data
 
 
 def _python(spec: Policy, name: str) -> Act:
@@ -115,7 +123,7 @@ def _python(spec: Policy, name: str) -> Act:
     return policy  # type: ignore[no-any-return]
 
 
-def _torchscript(path: Path, name: str, zeros: Array, n_outputs: int) -> Act:
+def _torchscript(data: bytes, name: str, zeros: Array, n_outputs: int) -> Act:
     try:
         import torch
     except ImportError as error:
@@ -126,7 +134,7 @@ def _torchscript(path: Path, name: str, zeros: Array, n_outputs: int) -> Act:
     torch.set_num_threads(1)  # a policy is small, and a sweep has a process on every core
     try:
         with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
-            module = torch.jit.load(str(path), map_location="cpu")  # type: ignore[no-untyped-call]
+            module = torch.jit.load(BytesIO(data), map_location="cpu")  # type: ignore[no-untyped-call]
     except (
         Exception
     ) as error:  # torch raises RuntimeError, and others for files that are no archive
@@ -152,7 +160,7 @@ def _torchscript(path: Path, name: str, zeros: Array, n_outputs: int) -> Act:
     return lambda observation: run(observation, batch)
 
 
-def _onnx(path: Path, name: str, zeros: Array, n_outputs: int) -> Act:
+def _onnx(data: bytes, name: str, zeros: Array, n_outputs: int) -> Act:
     try:
         import onnxruntime
     except ImportError as error:
@@ -163,10 +171,12 @@ def _onnx(path: Path, name: str, zeros: Array, n_outputs: int) -> Act:
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4  # its errors are told as ours
     try:
-        session = onnxruntime.InferenceSession(str(path), options, ["CPUExecutionProvider"])
+        # Of bytes, so that weights in files beside it are refused: they could be any file.
+        session = onnxruntime.InferenceSession(data, options, ["CPUExecutionProvider"])
     except Exception as error:  # of its own making, each derived from Exception alone
         raise ScenarioError(
-            f"{name}: onnxruntime cannot read it: {_first_line(error)}; allowed: an ONNX model"
+            f"{name}: onnxruntime cannot read it: {_first_line(error)}; allowed: an ONNX model, "
+            "its weights in it"
         ) from error
     inputs = session.get_inputs()
     shape = inputs[0].shape if inputs else []

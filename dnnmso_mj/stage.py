@@ -6,7 +6,7 @@ interpreter is done here, between two blocks of ticks.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -184,12 +184,8 @@ class Stage:
         self.tick += len(rows)
         if len(rows):
             recorder.append(rows)
-            for change in self._changes.events(rows):
-                recorder.event(change)
-        if self.world.safety.ticks[0] and not self._stop_told:
-            self._stop_told = True
-            t = self._stop_tick * self.scenario.dt
-            recorder.event(Event(t, "warning", f"safe stop: {self._tripped}"))
+            for happened in sorted(self._told(rows), key=lambda event: event.t):
+                recorder.event(happened)
 
     @property
     def ended(self) -> bool:
@@ -243,6 +239,14 @@ class Stage:
                 raise NonFiniteError(name, values.tolist())
         if self.world.safety.ticks[0] and self.tick == self.scenario.n_ticks:
             raise self._safe_stop()
+
+    def _told(self, rows: Array) -> Iterator[Event]:
+        """What a block's rows say has happened, and a safe stop that began in it."""
+        yield from self._changes.events(rows)
+        if self.world.safety.ticks[0] and not self._stop_told:
+            self._stop_told = True
+            t = self._stop_tick * self.scenario.dt
+            yield Event(t, "warning", f"safe stop: {self._tripped}")
 
     def _safe_stop(self) -> SafeStopError:
         t = self._stop_tick * self.scenario.dt

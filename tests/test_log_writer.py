@@ -22,14 +22,16 @@ from mcap.records import (
     DataEnd,
     Footer,
     Header,
+    Message,
     MessageIndex,
     Metadata,
+    Schema,
     SummaryOffset,
 )
 from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
-from dnnmso_mj import __version__ as VERSION
+from dnnmso_mj import __version__
 from dnnmso_mj.log.background import Background
 from dnnmso_mj.log.messages import HEADER_SIZE, RECORD, Messages, pack, pack_one, unpack
 from dnnmso_mj.log.writer import CHUNK_BYTES, LogWriter
@@ -153,7 +155,8 @@ def test_an_empty_file_is_complete_too(tmp_path: Path) -> None:
     with (tmp_path / "empty.mcap").open("wb") as file:
         LogWriter(file).finish()
     with (tmp_path / "empty.mcap").open("rb") as file:
-        assert make_reader(file, validate_crcs=True).get_summary().statistics.message_count == 0
+        found = make_reader(file, validate_crcs=True).get_summary().statistics
+    assert (found.message_count, found.message_start_time, found.message_end_time) == (0, 0, 0)
 
 
 # ---- the thread
@@ -242,7 +245,10 @@ def written() -> bytes:
     writer.add_metadata("one", {"key": "value"})
     writer.add_attachment(7, "first.bin", "application/x-first", b"123")
     schema = writer.add_schema("Thing", "jsonschema", b"{}")
-    channels = [writer.add_channel(f"/{name}", "json", id) for name, id in zip("ab", (schema, 0), strict=True)]
+    channels = [
+        writer.add_channel(f"/{name}", "json", id)
+        for name, id in zip("ab", (schema, 0), strict=True)
+    ]
     other = writer.add_schema("Other", "protobuf", b"other")
     writer.add_channel("/unused", "protobuf", other)
     writer.add_message(channels[0], 500, b"{}")
@@ -263,7 +269,11 @@ def test_a_file_begins_with_who_wrote_it(written: bytes) -> None:
     header = Header.read(stream)
     assert written.startswith(MCAP0_MAGIC)
     assert written.endswith(MCAP0_MAGIC)
-    assert (opcode, header.profile, header.library) == (Opcode.HEADER, "", f"dnnmso_mj {VERSION}")
+    assert (opcode, header.profile, header.library) == (
+        Opcode.HEADER,
+        "",
+        f"dnnmso_mj {__version__}",
+    )
 
 
 def test_schemas_and_channels_come_back_as_they_were_given(written: bytes) -> None:
@@ -291,10 +301,13 @@ def test_messages_come_back_with_their_times_from_any_reader(written: bytes) -> 
 
 
 def test_each_index_says_where_and_what_its_record_is(written: bytes) -> None:
-    before, footer = parts_of(written)
+    before, _ = parts_of(written)
     summary = make_reader(io.BytesIO(written)).get_summary()
     kinds = {
-        Opcode.CHUNK: (Chunk, [(c.chunk_start_offset, c.chunk_length) for c in summary.chunk_indexes]),
+        Opcode.CHUNK: (
+            Chunk,
+            [(c.chunk_start_offset, c.chunk_length) for c in summary.chunk_indexes],
+        ),
         Opcode.ATTACHMENT: (Attachment, [(a.offset, a.length) for a in summary.attachment_indexes]),
         Opcode.METADATA: (Metadata, [(m.offset, m.length) for m in summary.metadata_indexes]),
     }
@@ -354,20 +367,33 @@ def test_the_summary_says_where_each_group_of_it_is(written: bytes) -> None:
     ]
 
 
-def test_a_chunk_is_ended_only_when_the_next_message_would_not_fit() -> None:
+@pytest.mark.parametrize(("size", "chunks"), [(100, [64 * 1024]), (101, [65405, 132])])
+def test_a_chunk_is_ended_only_before_a_message_that_does_not_fit(
+    size: int, chunks: list[int]
+) -> None:
     file = io.BytesIO()
     writer = LogWriter(file)
     channel = writer.add_channel("/a", "json", 0)
     begun = len(file.getvalue())
-    free = 64 * 1024 - len(channel_record(channel))
-    writer.add_message(channel, 0, bytes(free - 2 * HEADER_SIZE - 100))
-    writer.add_message(channel, 0, bytes(100))
-    assert len(file.getvalue()) == begun  # full to the last byte
+    writer.add_message(channel, 0, bytes(64 * 1024 - len(channel_record(channel)) - 162))
+    writer.add_message(channel, 0, bytes(size))
+    assert (len(file.getvalue()) > begun) == (len(chunks) > 1)
+    writer.flush()
     writer.add_message(channel, 0, b"")
-    assert len(file.getvalue()) > begun
     writer.finish()
-    chunks = make_reader(io.BytesIO(file.getvalue())).get_summary().chunk_indexes
-    assert [c.uncompressed_size for c in chunks] == [64 * 1024, HEADER_SIZE]
+    found = make_reader(io.BytesIO(file.getvalue())).get_summary().chunk_indexes
+    assert [chunk.uncompressed_size for chunk in found] == [*chunks, HEADER_SIZE]
+
+
+def test_a_chunk_of_messages_packed_together_spans_their_times() -> None:
+    file = io.BytesIO()
+    writer = LogWriter(file)
+    writer.add_messages(some_messages(3, 5, writer.add_channel("/a", "json", 0)))
+    writer.finish()
+    summary = make_reader(io.BytesIO(file.getvalue())).get_summary()
+    (chunk,), statistics = summary.chunk_indexes, summary.statistics
+    for found in (chunk, statistics):
+        assert (found.message_start_time, found.message_end_time) == (2**40, 2**40 + 2_000_000)
 
 
 def channel_record(channel: int) -> bytes:
@@ -399,3 +425,16 @@ def test_flush_and_finish_hand_all_to_the_operating_system() -> None:
     writer.add_channel("/a", "json", 0)
     writer.flush()
     assert len(empty.getvalue()) == empty.flushed < 60  # a channel waits for its first message
+
+
+def test_what_stands_before_the_summary_can_be_read_alone(written: bytes) -> None:
+    """As of a torn log: each message's channel and schema go before it."""
+    records = list(StreamReader(io.BytesIO(written), validate_crcs=True).records)
+    torn = records[: next(k for k, r in enumerate(records) if isinstance(r, DataEnd))]
+    schemas = {r.id: r.name for r in torn if isinstance(r, Schema)}
+    channels = {r.id: r.topic for r in torn if isinstance(r, Channel)}
+    assert schemas == {1: "Thing", 2: "Other"}
+    assert channels == {1: "/a", 2: "/b", 3: "/unused"}
+    first = next(k for k, r in enumerate(torn) if isinstance(r, Message))
+    assert sum(isinstance(r, Schema | Channel) for r in torn[:first]) == 5
+    assert sum(isinstance(r, Message) for r in torn) == 12

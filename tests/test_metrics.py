@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from trace_samples import DT, METRICS, trace_with
 
+from dnnmso_mj import metrics as metrics_module
 from dnnmso_mj.metrics import bound_violations, compute_metrics, settling_time
 from dnnmso_mj.trace import StepLayout, Trace
 
@@ -243,3 +244,19 @@ def test_every_metric_is_finite_or_none_and_survives_json(error: np.ndarray) -> 
     trace = trace_of(len(error), n_joints=3, q=error, tau=error, compute_us=error[:, 0])
     metrics = compute_metrics(trace)
     assert json.loads(json.dumps(metrics, allow_nan=False)) == metrics
+
+
+def test_blocks_change_a_metric_by_its_rounding_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    columns = {name: rng.normal(size=(500, 2)) for name in ("q", "q_ref", "tau")}
+    columns["q"] *= np.exp(-np.arange(500) / 50)[:, None]
+    columns["q_ref"][:] = 0.0
+    columns |= {"f_true": rng.normal(size=(500, 4)), "compute_us": rng.exponential(size=500)}
+    columns["deadline_missed"] = rng.random(500) < 0.1
+    trace = trace_of(500, ultimate_bound=0.1, **columns)
+    whole = compute_metrics(trace)
+    assert None not in whole.values()
+    for ticks in (1, 2, 63, 249, 250, 251, 499, 500):
+        monkeypatch.setattr(metrics_module, "BLOCK", ticks)
+        for name, value in compute_metrics(trace).items():
+            assert value == pytest.approx(whole[name], rel=1e-13), (ticks, name)

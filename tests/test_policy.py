@@ -172,11 +172,10 @@ def test_paths_are_from_the_file_that_names_them(laws, tmp_path, monkeypatch):
     assert spec.python == f"{tmp_path / 'laws.py'}:PdLaw"
     beside = f"controller={{from: '{laws / 'p.yaml'}', torque_scale: 9}}"
     (laws / "p.yaml").write_text("controller: {kind: policy, file: law.pt}\n")
-    assert load_scenario("paper", [beside]).controller.file == str(laws / "law.pt")
+    assert load_scenario("paper", [beside], trust=True).controller.file == str(laws / "law.pt")
     monkeypatch.chdir(laws)
-    assert load_scenario(scenario, ["controller={kind: policy, file: law.pt}"]).controller.file == (
-        str(laws / "law.pt")
-    )
+    named = ["controller={kind: policy, file: law.pt}"]
+    assert load_scenario(scenario, named, trust=True).controller.file == (str(laws / "law.pt"))
     changed = load_scenario(scenario, ["controller.python=other.py:X"], trust=True).controller
     assert changed.python == f"{laws / 'other.py'}:X"
 

@@ -164,9 +164,7 @@ class SlowAtFirst(MemoryRecorder):
 
 
 @pytest.mark.parametrize("interpreted", [False, True])
-def test_a_first_tick_that_is_begun_too_late_is_the_watchdogs(
-    make_scenario, two_link, interpreted
-):
+def test_a_first_tick_that_is_begun_too_late_is_the_watchdogs(make_scenario, two_link, interpreted):
     spec = make_scenario({"kind": "no_network"}, duration=0.3, dt=0.005)
     controller = Dozing(Simulation(spec, two_link).controller, set()) if interpreted else None
     simulation = Simulation(spec, two_link, pace=real_time_pace(spec), controller=controller)

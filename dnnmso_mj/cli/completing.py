@@ -24,6 +24,7 @@ from dnnmso_mj.paths import (
     shipped_controllers,
 )
 
+MAX_READ = 64 * 1024  # characters of a scenario
 _KIND = r"^{part}:.*\n(?:(?: .*|#.*|)\n)*?  kind: *(\w+)"  # of a part, in a scenario's text
 
 
@@ -111,7 +112,8 @@ def _chosen_kinds(scenario: str | None, overrides: Iterable[str]) -> dict[str, s
     chosen: dict[str, str] = {}
     if scenario is not None:
         try:
-            text = find_scenario(scenario).read_text(encoding="utf-8")
+            with find_scenario(scenario).open(encoding="utf-8") as file:
+                text = file.read(MAX_READ)
         except (DnnmsoError, OSError, UnicodeDecodeError):
             text = ""
         for part in ("controller", "reference"):

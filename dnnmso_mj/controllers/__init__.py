@@ -95,8 +95,14 @@ class Command(NamedTuple):
 
 def no_command(like: Command) -> Command:
     """What stands in the log until a controller's first command: zeros, as many as it will have."""
-    monitors = Monitors(*map(np.zeros_like, like.monitors))
-    return Command(*map(np.zeros_like, like[:-1]), monitors)
+    return Command(
+        tau=np.zeros_like(like.tau),
+        Bu=np.zeros_like(like.Bu),
+        x_hat=np.zeros_like(like.x_hat),
+        f_hat=np.zeros_like(like.f_hat),
+        e_obs=np.zeros_like(like.e_obs),
+        monitors=Monitors(*map(np.zeros_like, like.monitors)),
+    )
 
 
 def command_of(inversion: DynamicInversion, e_obs: Array, monitors: Monitors) -> Command:

@@ -17,9 +17,10 @@ from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading.advice import advice
 from dnnmso_mj.loading.complaints import Complaint, complain, explain
 from dnnmso_mj.loading.documents import Node, Problem, read_document
-from dnnmso_mj.loading.overrides import Override, apply_overrides, parse_overrides
+from dnnmso_mj.loading.overrides import apply_overrides, parse_overrides
 from dnnmso_mj.loading.pinning import pin_policy
 from dnnmso_mj.loading.places import Places
+from dnnmso_mj.loading.reach import in_reach, out_of_reach, refused
 from dnnmso_mj.loading.shape import Shape, lookup, scenario_schema
 from dnnmso_mj.loading.text import read_text
 from dnnmso_mj.loading.trust import PROBLEM, anchored, import_paths, require_trust
@@ -68,8 +69,8 @@ def load_scenario(
         overrides: `--set` strings, "plant.gravity=1.62"; see `dnnmso_mj.loading.overrides`.
         controller: what replaces the scenario's own controller, before `overrides` change it: a
             shipped tuned controller, a kind with its defaults, or a file.
-        trust: whether it may name code by import path, which a run of it then runs; nothing is
-            imported here.
+        trust: whether it may name code by import path, which a run of it then runs, and files
+            that are out of reach (`dnnmso_mj.loading.reach`); nothing is imported here.
 
     Returns:
         The scenario. Its plant.model is a name that is found from anywhere, or an absolute path; so
@@ -87,12 +88,14 @@ def load_scenario(
     """
     if controller is not None:
         overrides = [controller_set(controller), *overrides]
-    draft = _draft(source, overrides)
+    draft = _draft(source, overrides, trust)
     data, places, complaints = draft.data, draft.places, draft.complaints
-    complaints += _resolve_model(data, draft.file, places.sets)
+    complaints += _resolve_model(data, places, trust)
     if not trust:
         complaints += [complain(path, data, PROBLEM) for path, _ in import_paths(data)]
-    pin_policy(data)
+        complaints += out_of_reach(data, places)
+    if not complaints:
+        pin_policy(data)
     scenario = None
     try:
         scenario = Scenario.model_validate(data)
@@ -162,7 +165,7 @@ def located(
         error: raised by what was built from the scenario; its text begins with a key path.
         source, overrides: what `load_scenario` made the scenario of.
     """
-    draft = _draft(source, overrides)
+    draft = _draft(source, overrides, trust=True)
     named = re.match(r"[a-z]\w*(\.\w+)*", str(error))
     path = tuple(named.group().split(".")) if named else ()
     if not path or Shape.root().at(path, draft.data) is None:
@@ -180,7 +183,6 @@ def list_scenarios() -> list[tuple[str, str]]:
 class _Draft:
     """A scenario before it is checked: its data, overridden, and what is wrong with it so far."""
 
-    file: Path
     data: dict[str, Any]
     places: Places
     problems: list[Problem]
@@ -188,7 +190,7 @@ class _Draft:
     controller_lost: bool
 
 
-def _draft(source: str | Path, overrides: Sequence[str]) -> _Draft:
+def _draft(source: str | Path, overrides: Sequence[str], trust: bool) -> _Draft:
     sets = parse_overrides(overrides)
     file = find_scenario(source)
     root, problems = read_document(read_text(file))
@@ -199,12 +201,12 @@ def _draft(source: str | Path, overrides: Sequence[str]) -> _Draft:
     data = anchored(root.plain(), file.absolute().parent)
     grafts: list[Graft] = []
     if not any(item.path == CONTROLLER for item in sets):
-        grafts, more = graft_file(data, file.absolute().parent)
+        grafts, more = graft_file(data, file.absolute().parent, trust)
         complaints += more
     lost = bool(complaints)
     complaints += apply_overrides(data, sets)
     places = Places(file, root, sets, [*grafts, *brought])
-    return _Draft(file, data, places, problems, complaints, lost)
+    return _Draft(data, places, problems, complaints, lost)
 
 
 def _not_a_scenario(root: Node | None) -> Problem:
@@ -215,15 +217,19 @@ def _not_a_scenario(root: Node | None) -> Problem:
     return Problem(root.line, f"the file holds {found}; {keys}")
 
 
-def _resolve_model(data: Any, file: Path, sets: Sequence[Override]) -> list[Complaint]:
+def _resolve_model(data: Any, places: Places, trust: bool) -> list[Complaint]:
     """Replace plant.model in `data` by what it is found by from any folder."""
     path = ("plant", "model")
     name = lookup(data, path)
     if not isinstance(name, str):
         return []
-    base = Path.cwd() if any(item.covers(path) for item in sets) else file.absolute().parent
+    home = places.home(path)
     try:
-        data["plant"]["model"] = model_name(find_model(name, base), name)
+        file = find_model(name, home or Path.cwd())
     except ScenarioError as error:
         return [complain(path, data, str(error))]
+    found = model_name(file, name)
+    if found == str(file) and home is not None and not trust and not in_reach(file, home):
+        return [refused(path, data, home)]
+    data["plant"]["model"] = found
     return []

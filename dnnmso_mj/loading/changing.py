@@ -14,6 +14,7 @@ from dnnmso_mj.loading.complaints import Complaint, complain, explain
 from dnnmso_mj.loading.overrides import Override, apply_overrides, parse_overrides
 from dnnmso_mj.loading.pinning import pin_policy
 from dnnmso_mj.loading.places import Places
+from dnnmso_mj.loading.reach import out_of_reach
 from dnnmso_mj.loading.shape import lookup
 from dnnmso_mj.loading.trust import PROBLEM, import_paths, require_trust
 from dnnmso_mj.loading.tuned import graft_sets
@@ -39,7 +40,7 @@ def change_scenario(
         overrides: `--set` strings, as `load_scenario` takes them. Relative paths in them begin in
             the current folder.
         source: the log, for messages.
-        trust: whether both may name code by import path.
+        trust: whether both may name code by import path, and files that are out of reach.
 
     Raises:
         ScenarioError: one line a problem; an override is malformed, changes what a run that has
@@ -56,9 +57,11 @@ def change_scenario(
         complain((key,), data, why) for key, why in SETTLED.items() if data[key] != settled[key]
     ]
     complaints += begun or _resolve_model(data, sets)
-    _pin(data, sets)
     if not trust:
         complaints += [complain(path, data, PROBLEM) for path, _ in import_paths(data)]
+        complaints += out_of_reach(data, places)
+    if not complaints:
+        _pin(data, sets)
     try:
         changed = Scenario.model_validate(data)
     except ValidationError as error:

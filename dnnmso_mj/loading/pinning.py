@@ -18,4 +18,5 @@ def pin_policy(data: Any) -> None:
     file = controller.get("file")
     if isinstance(file, str) and controller.get("sha256") is None:
         with suppress(OSError, ValueError):  # no such file: told when it is opened
-            controller["sha256"] = digest(Path(file))
+            if Path(file).is_file():  # of a device or a FIFO there is no end
+                controller["sha256"] = digest(Path(file))

@@ -19,6 +19,10 @@ class Elsewhere(Protocol):
     """What a scenario takes from another file."""
 
     @property
+    def file(self) -> Path:
+        """Where it stands."""
+
+    @property
     def cause(self) -> Override | None:
         """The override that names it; None: the scenario does."""
 
@@ -43,6 +47,7 @@ class Places:
         grafts: Sequence[Elsewhere] = (),
     ) -> None:
         self.name = clean(str(file))
+        self._folder = file.absolute().parent
         self.root = root or Node(1, None)
         self.data = self.root.plain()
         self.sets = sets
@@ -57,6 +62,15 @@ class Places:
         if len(texts) > MAX_LINES:
             texts[MAX_LINES:] = [f"… and {len(texts) - MAX_LINES} more"]
         return "\n".join(texts)
+
+    def home(self, path: KeyPath) -> Path | None:
+        """The folder of the file that says what the scenario has at a path; None: an override."""
+        causes = [item for item in self.sets if item.covers(path)]
+        cause = max(reversed(causes), key=lambda item: len(item.path)) if causes else None
+        graft = next((g for g in self._from(cause) if g.place(path)), None)
+        if graft is not None:
+            return graft.file.absolute().parent
+        return None if cause else self._folder
 
     def of(self, complaint: Complaint) -> tuple[tuple[int, int], str]:
         """What to sort a complaint by, and its place in words."""
@@ -74,6 +88,10 @@ class Places:
 
     def _elsewhere(self, path: KeyPath, cause: Override | None) -> str | None:
         """Where what `cause` (None: the file) has at `path` was taken from, if it was."""
-        text = cause and cause.text
-        places = (g.place(path) for g in self._grafts if (g.cause and g.cause.text) == text)
+        places = (graft.place(path) for graft in self._from(cause))
         return next((place for place in places if place), None)
+
+    def _from(self, cause: Override | None) -> list[Elsewhere]:
+        """What `cause` names (None: the file does)."""
+        text = cause and cause.text
+        return [graft for graft in self._grafts if (graft.cause and graft.cause.text) == text]

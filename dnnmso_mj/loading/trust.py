@@ -1,7 +1,8 @@
 """Scenarios that run code: the keys `python`, where import paths begin, and who may use them.
 
 An import path, "module:Name" or "file.py:Name", is refused unless the caller trusts the scenario.
-The name of an entry point is not: somebody installed its package. Nothing is imported here.
+The name of an entry point is not: somebody installed its package. TorchScript is refused alike,
+since it is code that may open files; ONNX is not. Nothing is imported here.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.importing import is_import_path
 from dnnmso_mj.scenario import Scenario
+from dnnmso_mj.scenario.policy import TORCHSCRIPT
 from dnnmso_mj.wording import KeyPath, dotted, show
 
 PYTHON = "python"  # every key of this name holds what is imported, wherever it stands,
@@ -62,8 +64,12 @@ def named_code(data: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, str]]:
 
 
 def import_paths(data: Any) -> Iterator[tuple[KeyPath, str]]:
-    """Every import path in some data, and the key path that holds it."""
-    return ((path, name) for path, name in named_code(data) if is_import_path(name))
+    """Every import path in some data, and its policy in TorchScript; with the key path of each."""
+    yield from ((path, name) for path, name in named_code(data) if is_import_path(name))
+    controller = data.get("controller") if isinstance(data, dict) else None
+    file = controller.get(FILE) if isinstance(controller, dict) else None
+    if isinstance(file, str) and Path(file).suffix in TORCHSCRIPT:
+        yield ("controller", FILE), file
 
 
 def require_trust(scenario: Scenario, where: str) -> None:
@@ -74,7 +80,7 @@ def require_trust(scenario: Scenario, where: str) -> None:
         where: it came from, for the message.
 
     Raises:
-        ScenarioError: it names code by import path.
+        ScenarioError: it names code by import path, or a policy in TorchScript.
     """
     found = [
         f"{where}: {dotted(path)} = {show(value)}: {PROBLEM}"

@@ -20,10 +20,11 @@ from dnnmso_mj.loading.complaints import Complaint, explain
 from dnnmso_mj.loading.documents import Node, Problem, read_document
 from dnnmso_mj.loading.overrides import Override
 from dnnmso_mj.loading.places import Places
+from dnnmso_mj.loading.reach import PROBLEM, in_reach
 from dnnmso_mj.loading.shape import ABSENT, Shape, lookup
 from dnnmso_mj.loading.text import read_text
 from dnnmso_mj.loading.trust import anchored
-from dnnmso_mj.paths import find_controller
+from dnnmso_mj.paths import controllers_dir, find_controller
 from dnnmso_mj.scenario.tuned import TunedController
 from dnnmso_mj.wording import KeyPath, clean, show
 
@@ -62,14 +63,17 @@ class Graft:
         return merged
 
 
-def graft_file(data: dict[str, Any], folder: Path) -> tuple[list[Graft], list[Complaint]]:
+def graft_file(
+    data: dict[str, Any], folder: Path, trust: bool
+) -> tuple[list[Graft], list[Complaint]]:
     """Put the controller that a scenario names in its place in `data`.
 
     Args:
         data: the scenario, which is changed.
         folder: of the scenario, where relative paths begin.
+        trust: whether that file may be out of reach; see `dnnmso_mj.loading.reach`.
     """
-    found = _graft(data.get("controller"), folder, None)
+    found = _graft(data.get("controller"), folder, None, anywhere=trust)
     if isinstance(found, Complaint):
         data["controller"].pop("from")
         return [], [found]
@@ -126,7 +130,9 @@ def read_tuned(file: Path) -> Node:
     return root
 
 
-def _graft(value: Any, folder: Path, cause: Override | None) -> Graft | Complaint | None:
+def _graft(
+    value: Any, folder: Path, cause: Override | None, *, anywhere: bool = True
+) -> Graft | Complaint | None:
     """What a controller with `from` is made of; None for one without."""
     if not isinstance(value, dict) or "from" not in value:
         return None
@@ -139,6 +145,8 @@ def _graft(value: Any, folder: Path, cause: Override | None) -> Graft | Complain
         file = find_controller(name, folder)
     except ScenarioError as error:
         return Complaint(FROM, f"{at}: {error}")
+    if not anywhere and file.parent != controllers_dir() and not in_reach(file, folder):
+        return Complaint(FROM, f"{at}: {PROBLEM.format(clean(str(folder)))}")
     found = Graft(file, read_tuned(file), own, cause)
     kind = found.root.plain()["controller"]["kind"]
     if own.get("kind", kind) != kind:

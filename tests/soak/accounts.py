@@ -49,7 +49,9 @@ def against_itself(trace: Trace, period: int) -> list[str]:
         1 + np.flatnonzero(late[1:] < ready[:-1] - period - ROUNDING_NS),
     )
     # A tick that is flagged ended after the next was due, which then did not wait.
-    out += few("are due after a miss, yet on time", 1 + np.flatnonzero(missed[:-1] & (late[1:] <= 0)))
+    out += few(
+        "are due after a miss, yet on time", 1 + np.flatnonzero(missed[:-1] & (late[1:] <= 0))
+    )
     return out + against_events(trace, missed)
 
 

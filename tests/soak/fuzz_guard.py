@@ -70,8 +70,8 @@ class Guard:
     """Tries a target on inputs, and counts.
 
     Memory is the growth of what is resident, from just before a case to its peak: the kernel's own
-    high-water mark, put back before each case. Time is by the clock; a case over its time is tried
-    again, and the shortest time counts.
+    high-water mark, put back before each case. Time is by the clock, less what others had the core
+    for; a case over its time is tried again, and the shortest time counts.
 
     Args:
         target: returns, or raises a `DnnmsoError`.
@@ -85,6 +85,7 @@ class Guard:
         with note.open("r+b") as file:
             self._note = mmap.mmap(file.fileno(), 0)
         self._memory = Memory()
+        self._scheduler = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
 
     def __call__(self, data: bytes) -> None:
         """One case."""
@@ -93,7 +94,7 @@ class Guard:
         kept = data[:KEPT]
         self._note[: _HEAD.size + len(kept)] = _HEAD.pack(found.cases, len(kept)) + kept
         self._memory.begin()
-        seconds, failed = self._timed(data)
+        seconds, refused, why = self._timed(data)
         grown = self._memory.grown()
         for _ in range(AGAIN):
             if seconds > MAX_S:
@@ -101,33 +102,33 @@ class Guard:
         found.slowest_s = max(found.slowest_s, seconds)
         found.largest_mb = max(found.largest_mb, grown / 2**20)
         if seconds > MAX_S:
-            failed = failed or ("slow", f"took {seconds:.2f} s")
+            why["slow"] = f"took {seconds:.2f} s"
         if grown > MAX_BYTES:
-            failed = failed or ("large", f"took {grown / 2**20:.0f} MB")
-        if failed:
-            self._keep(*failed, data)
+            why["large"] = f"took {grown / 2**20:.0f} MB"
+        found.refused += refused and not why
+        found.accepted += not (refused or why)
+        for key, what in why.items():
+            self._keep(key, what, data)
 
-    def _timed(self, data: bytes) -> tuple[float, tuple[str, str] | None]:
-        """Seconds, and in which way it failed, if it did."""
-        started, failed, refused = time.perf_counter(), None, False
+    def _timed(self, data: bytes) -> tuple[float, bool, dict[str, str]]:
+        """Seconds, whether it was refused, and in which way it failed, if it did."""
+        started, refused, why = self._clock(), False, {}
         try:
             self._target(data)
         except DnnmsoError as error:
-            refused = True
-            text = str(error)
+            refused, text = True, str(error)
             if not text.strip() or not _is_printable(text):
-                failed = "message", f"the message {text!r:.100} cannot be printed"
+                why["message"] = f"the message {text!r:.100} cannot be printed"
         except Exception as error:
-            failed = _place(error), f"{type(error).__name__}: {str(error)[:200]!r}"
-        seconds = time.perf_counter() - started
-        if not failed and seconds <= MAX_S:
-            self.found.refused += refused
-            self.found.accepted += not refused
-        return seconds, failed
+            why[_place(error)] = f"{type(error).__name__}: {str(error)[:200]!r}"
+        return self._clock() - started, refused, why
+
+    def _clock(self) -> float:
+        """Seconds in which this thread ran, or waited for anything but a free core."""
+        waited = os.pread(self._scheduler, 100, 0).split()[1]
+        return time.perf_counter() - int(waited) / 1e9
 
     def _keep(self, key: str, what: str, data: bytes) -> None:
-        if key == "large":  # it was counted as tried well
-            self.found.accepted -= 1
         encoded = base64.b64encode(data[:KEPT]).decode()
         failure = self.found.failures.setdefault(key, Failure(f"{key}: {what}", encoded))
         failure.cases += 1

@@ -15,7 +15,8 @@ from dnnmso_mj.scenario import Plant
 from dnnmso_mj.scene import Scene
 
 MAX_LEN = 2500
-SMALL = """<mujoco><worldbody><body name="link1"><joint name="j" axis="0 1 0"/><geom name="g"
+SMALL = """<mujoco><option><flag contact="disable"/></option><worldbody><body name="link1">
+<joint name="j" axis="0 1 0"/><geom name="g"
 type="capsule" fromto="0 0 0 1 0 0" size="0.05"/></body></worldbody><actuator><motor name="m"
 joint="j"/></actuator></mujoco>"""
 TAGS = (
@@ -39,13 +40,45 @@ ATTRIBUTES = (
     "boundmass", "spacing", "dim", "radius", "node", "element", "curve", "initial", "vertcount",
 )  # fmt: skip
 VALUES = (
+    "0.1", "0.5", "2", "0.1 0.2 0.3", "0 1 0", "0.7 0 0.7 0", "x1", "x2",
     "0", "1", "-1", "nan", "inf", "1e308", "1e-320", "1e9", "20000", "2147483648", "-2147483648",
     "0 0 0", "1 0 0 0", "0 0 1", "1 2 3 4 5 6", "true", "false", "auto", "j", "g", "m", "link1",
     "sphere", "box", "mesh", "hfield", "capsule", "plane", "ball", "free", "slide", "hinge", "../x",
     "/etc/passwd", "x.obj", "x.stl", "mujoco.elasticity.cable", "", "a" * 300, "1 " * 200,
 )  # fmt: skip
-WORDS = [*(f"<{tag}" for tag in TAGS), *(f' {name}="' for name in ATTRIBUTES), *VALUES, "/>", "&lt;",
-         "<!DOCTYPE", "<!ENTITY a '", "&a;", "<![CDATA[", "<?xml version='1.0' encoding='", "<!--"]  # fmt: skip
+KNOWN = {  # what an element usually has
+    "body": ("name", "pos", "quat", "axisangle", "euler", "childclass", "mocap", "gravcomp"),
+    "joint": (
+        "name",
+        "type",
+        "axis",
+        "pos",
+        "range",
+        "limited",
+        "armature",
+        "ref",
+        "class",
+        "damping",
+    ),
+    "geom": ("name", "type", "size", "pos", "fromto", "mass", "density", "rgba", "mesh", "class"),
+    "site": ("name", "pos", "size", "type", "quat"),
+    "inertial": ("pos", "mass", "diaginertia", "fullinertia", "quat"),
+    "motor": ("name", "joint", "gear", "ctrlrange", "group", "class"),
+    "option": ("timestep", "gravity", "integrator", "iterations", "solver"),
+    "compiler": ("angle", "coordinate", "balanceinertia", "boundmass", "eulerseq", "autolimits"),
+    "replicate": ("count", "offset", "euler", "sep"),
+    "frame": ("pos", "quat", "euler"),
+    "mesh": ("name", "vertex", "face", "scale", "file", "builtin", "inertia", "params"),
+    "hfield": ("name", "nrow", "ncol", "size", "elevation", "file"),
+    "texture": ("name", "type", "builtin", "width", "height", "file", "rgb1"),
+    "default": ("class",),
+    "numeric": ("name", "size", "data"),
+    "key": ("name", "time", "qpos", "qvel"),
+    "light": ("name", "pos", "dir"),
+    "camera": ("name", "pos", "mode", "target"),
+}
+_MARKS = ("/>", "&lt;", "<!DOCTYPE", "<!ENTITY a '", "&a;", "<![CDATA[", "<?xml encoding='", "<!--")
+WORDS = [*(f"<{tag}" for tag in TAGS), *(f' {name}="' for name in ATTRIBUTES), *VALUES, *_MARKS]
 
 
 def seeds(work: Path) -> list[bytes]:
@@ -110,27 +143,70 @@ def mutate(data: bytes, rng: random.Random, raw: Callable[[bytes, int], bytes]) 
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError):
         return bytes(raw(data, MAX_LEN))
-    for _ in range(rng.randint(1, 3)):
-        elements = list(root.iter())
-        here, other = rng.choice(elements), rng.choice(elements)
-        match rng.randrange(6):
-            case 0:
-                here.set(rng.choice(ATTRIBUTES), rng.choice(VALUES))
-            case 1 if here.attrib:
-                here.set(rng.choice(list(here.attrib)), rng.choice(VALUES))
-            case 2:
-                here.append(
-                    ElementTree.Element(
-                        rng.choice(TAGS), {rng.choice(ATTRIBUTES): rng.choice(VALUES)}
-                    )
-                )
-            case 3 if len(here):
-                here.remove(rng.choice(list(here)))
-            case 4 if other is not root and here not in other.iter():
-                here.append(ElementTree.fromstring(ElementTree.tostring(other)))
-            case _:
-                here.tag = rng.choice(TAGS)
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        here = rng.choice(list(root.iter()))
+        rng.choice((_set, _set, _change, _change, _drop, _add, _cut, _copy, _copy, _rename))(
+            here, rng
+        )
     return ElementTree.tostring(root)
+
+
+def _set(here: ElementTree.Element, rng: random.Random) -> None:
+    here.set(_attribute(here.tag, rng), rng.choice(VALUES))
+
+
+def _attribute(tag: str, rng: random.Random) -> str:
+    return rng.choice(ATTRIBUTES if rng.random() < 0.1 else KNOWN.get(tag, ATTRIBUTES))
+
+
+def _change(here: ElementTree.Element, rng: random.Random) -> None:
+    here.set(rng.choice([*here.attrib] or ["name"]), rng.choice(VALUES))
+
+
+def _drop(here: ElementTree.Element, rng: random.Random) -> None:
+    here.attrib.pop(rng.choice([*here.attrib] or ["name"]), None)
+
+
+def _add(here: ElementTree.Element, rng: random.Random) -> None:
+    tag = rng.choice(TAGS if rng.random() < 0.2 else [*KNOWN])
+    part = ElementTree.SubElement(here, tag)
+    for _ in range(rng.randrange(4)):
+        _set(part, rng)
+
+
+def _cut(here: ElementTree.Element, rng: random.Random) -> None:
+    if len(here):
+        here.remove(rng.choice(list(here)))
+
+
+def _copy(here: ElementTree.Element, rng: random.Random) -> None:
+    """A copy of one of its children, or of itself, inside; with names of its own."""
+    copy = ElementTree.fromstring(ElementTree.tostring(rng.choice([*here, here])))
+    for number, part in enumerate(copy.iter()):
+        if "name" in part.attrib:
+            part.set("name", f"copy{number}{rng.randrange(1000)}")
+    here.append(copy)
+
+
+def _rename(here: ElementTree.Element, rng: random.Random) -> None:
+    here.tag = rng.choice(TAGS if rng.random() < 0.2 else [*KNOWN])
+
+
+CHANGES = (
+    _set,
+    _set,
+    _set,
+    _change,
+    _change,
+    _change,
+    _drop,
+    _add,
+    _add,
+    _cut,
+    _copy,
+    _copy,
+    _rename,
+)
 
 
 def target(work: Path) -> Any:

@@ -1,4 +1,4 @@
-"""A target that is really broken, to see that it is found: four bugs behind a word each."""
+"""A target that is really broken, to see that it is found: four bugs, behind a word each."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from typing import Any
 from dnnmso_mj.errors import ScenarioError
 
 MAX_LEN = 64
-BUGS = {b"key": "planted KeyError", b"slow": "slow", b"big": "large", b"die": "the process"}
-WORDS = [word.decode() for word in BUGS]
+WORDS = ["key", "slow", "big", "die"]
 
 
 def seeds(work: Path) -> list[bytes]:
-    return [b"a", *([os.environ["PLANTED"].encode()] if "PLANTED" in os.environ else [])]
+    return [b"a"]
 
 
 def strategy() -> Any:
@@ -25,14 +24,17 @@ def strategy() -> Any:
 
 
 def target(work: Path) -> Any:
+    slow: list[bytes] = []
+
     def tried(data: bytes) -> None:
-        if data == b"key":
+        if b"key" in data:
             raise KeyError("planted")
-        if data == b"slow":
-            time.sleep(1.2)
-        if data == b"big":
-            bytearray(b"x" * 300 * 2**20)
-        if data == b"die":
+        if b"slow" in data and (not slow or data in slow):
+            slow.append(data)
+            time.sleep(1.1)
+        if b"big" in data:
+            bytearray(bytes(300 * 2**20))
+        if b"die" in data:
             os.abort()
         raise ScenarioError("refused: allowed: nothing")
 

@@ -33,7 +33,12 @@ GUIDED = [
     "dnnmso_mj.paths",
     "dnnmso_mj.assets",
     "dnnmso_mj.links",
+    "dnnmso_mj.mjcf",
+    "dnnmso_mj.recorded",
 ]  # not what numba compiles
+RAW = 0.2  # of all cases, by atheris' own mutations alone
+ANEW = 0.4  # of the others, from a real file: what reaches new code is mostly refused early
+KEEP = 1000  # cases, after which what was found is written
 
 
 def main() -> None:
@@ -42,7 +47,8 @@ def main() -> None:
     warnings.simplefilter("ignore")
     with atheris.instrument_imports(include=GUIDED):
         import dnnmso_mj.loading
-        import dnnmso_mj.reading  # noqa: F401
+        import dnnmso_mj.mjcf
+        import dnnmso_mj.recorded  # noqa: F401
     part: Any = importlib.import_module(f"soak.{MODULES[name]}")
     from soak.fuzz_guard import Guard
 
@@ -64,12 +70,15 @@ def main() -> None:
         (corpus / f"{k:03}").write_bytes(data)
 
     def case(data: bytes) -> None:
+        known = len(guard.found.failures)
         guard(data)
-        if guard.found.cases >= generated + mutated:
+        over = guard.found.cases >= generated + mutated
+        if over or guard.found.cases % KEEP == 0 or len(guard.found.failures) > known:
             (folder / "found.json").write_text(json.dumps(guard.found.as_json()))
+        if over:
             os._exit(0)
 
-    _mutate(part, case, folder, seed)
+    _mutate(part, case, folder, seed, seeds)
 
 
 def _generate(part: Any, guard: Any, seed: int, count: int) -> None:
@@ -94,18 +103,19 @@ def _generate(part: Any, guard: Any, seed: int, count: int) -> None:
     try_it()
 
 
-def _mutate(part: Any, case: Any, folder: Path, seed: int) -> None:
+def _mutate(part: Any, case: Any, folder: Path, seed: int, seeds: list[bytes]) -> None:
     """Cases that atheris mutates, those first that reach new code; never returns."""
-    words = "\n".join(f'"{_escaped(word)}"' for word in part.WORDS)
+    words = "\n".join(f'"{_escaped(word)}"' for word in dict.fromkeys(part.WORDS) if word)
     (folder / "words.txt").write_text(words + "\n")
     options = [
         f"-dict={folder}/words.txt",
         f"-seed={seed % 2**31 + 1}",  # 0 would mean any
         f"-max_len={part.MAX_LEN}",
         "-rss_limit_mb=4096",
-        "-timeout=100",
+        "-timeout=1000000",  # `fuzzing` sees to that, and its alarm may kill
         "-reload=0",
         "-len_control=0",
+        "-mutate_depth=2",
         f"-artifact_prefix={folder}/",
         str(folder / "corpus"),
     ]
@@ -115,9 +125,14 @@ def _mutate(part: Any, case: Any, folder: Path, seed: int) -> None:
 
         def mutate(data: bytes, longest: int, number: int) -> bytes:
             rng = random.Random(number)
-            if rng.random() < 0.3:
+            if rng.random() < RAW:
                 return bytes(atheris.Mutate(data, longest))
-            return bytes(own(data, rng, atheris.Mutate))[:longest]
+            if rng.random() < ANEW:
+                data = rng.choice(seeds)
+            try:
+                return bytes(own(data, rng, atheris.Mutate))[:longest]
+            except Exception:  # what was broken before may be beyond surgery
+                return bytes(atheris.Mutate(data, longest))
 
         more = {"custom_mutator": mutate}
     atheris.Setup([sys.argv[0], *options], case, **more)
@@ -125,10 +140,10 @@ def _mutate(part: Any, case: Any, folder: Path, seed: int) -> None:
 
 
 def _escaped(word: str) -> str:
-    """As a libFuzzer dictionary has it."""
+    """As a libFuzzer dictionary has it; its words are short."""
     return "".join(
         chr(byte) if 32 <= byte < 127 and byte not in b'"\\' else f"\\x{byte:02x}"
-        for byte in word.encode()
+        for byte in word.encode()[:64]
     )
 
 

@@ -15,7 +15,8 @@ from dnnmso_mj.loading.shape import Shape
 from dnnmso_mj.paths import scenario_names, scenarios_dir
 from soak.fuzz_words import PATHS, SCENARIO, VALUES, WORDS
 
-MAX_LEN = 1500  # the parser takes 1 ms for each 700
+MAX_LEN = 1000  # the parser takes 1 ms for each 700
+DEEPEST = 6
 __all__ = ["MAX_LEN", "WORDS", "mutate", "seeds", "strategy", "target"]
 
 
@@ -41,70 +42,75 @@ def strategy() -> Any:
     """Nearly valid scenarios, drawn from the schema, as JSON, which YAML holds."""
     from hypothesis import strategies as st
 
-    odd = st.one_of(
-        st.none(),
-        st.booleans(),
-        st.floats(),
-        st.integers(),
-        st.text(max_size=8),
-        st.just([]),
-        st.just({}),
-    )
-
-    def value(shape: Shape, depth: int) -> Any:
-        if shape.kinds:
-            return st.sampled_from(sorted(shape.kinds)).flatmap(
-                lambda kind: group(shape.kinds[kind], depth, kind)
-            )
-        if shape.keys:
-            return group(shape, depth)
-        schema = shape.schema
-        usual: Any = st.sampled_from([1, 0.5, 10, -1, 0, "a", True, None, 1e-3])
-        if shape.choices:
-            usual = st.sampled_from(shape.choices)
-        elif "anyOf" in schema or schema.get("type") == "array":
-            entry = shape.child(0)
-            entries = value(entry, depth + 1) if entry is not None and depth < 6 else usual
-            usual = st.one_of(st.lists(entries, max_size=3), usual)
-        return st.one_of(usual, usual, usual, odd)
-
-    def group(shape: Shape, depth: int, kind: str | None = None) -> Any:
-        if depth > 6:
-            return odd
-        optional = {}
-        for key in shape.keys:
-            below = shape.child(key)
-            if below is not None and key != "kind":
-                optional[key] = st.deferred(lambda below=below: value(below, depth + 1))
-        fixed = {} if kind is None else {"kind": st.just(kind)}
-        few = st.lists(st.sampled_from(sorted(optional) or ["x"]), max_size=4, unique=True)
-        return few.flatmap(
-            lambda keys: st.fixed_dictionaries(
-                {**fixed, **{k: optional[k] for k in keys if k in optional}}
-            )
-        )
-
     root = Shape.root()
-    parts = {key: value(root.child(key), 1) for key in ("reference", "controller")}  # type: ignore[arg-type]
+    must = {
+        key: _value(part, 1) for key in ("reference", "controller") if (part := root.child(key))
+    }
     whole = st.builds(
-        lambda must, may: {**may, "name": "x", **must}, st.fixed_dictionaries(parts), group(root, 0)
+        lambda some, more: {**more, "name": "x", **some},
+        st.fixed_dictionaries(must),
+        _group(root, 0),
     )
-    return whole.map(lambda data: json.dumps(data).encode(errors="surrogatepass"))
+    return whole.map(lambda data: json.dumps(data).encode())
+
+
+def _odd() -> Any:
+    """What stands nowhere."""
+    from hypothesis import strategies as st
+
+    numbers = st.one_of(st.floats(), st.integers())
+    return st.one_of(
+        st.none(), st.booleans(), numbers, st.text(max_size=8), st.sampled_from([[], {}])
+    )
+
+
+def _value(shape: Shape, depth: int) -> Any:
+    """Mostly what may stand at a place."""
+    from hypothesis import strategies as st
+
+    if shape.kinds:
+        kinds = st.sampled_from(sorted(shape.kinds))
+        return kinds.flatmap(lambda kind: _group(shape.kinds[kind], depth, kind))
+    if shape.keys:
+        return _group(shape, depth)
+    usual: Any = st.sampled_from([1, 0.5, 10, -1, 0, "a", True, None, 1e-3])
+    entry = shape.child(0)
+    if shape.choices:
+        usual = st.sampled_from(shape.choices)
+    elif entry is not None and depth < DEEPEST:
+        usual = st.one_of(st.lists(_value(entry, depth + 1), max_size=3), usual)
+    return st.one_of(usual, usual, usual, _odd())
+
+
+def _group(shape: Shape, depth: int, kind: str | None = None) -> Any:
+    """Some of a part's keys, with their values."""
+    from hypothesis import strategies as st
+
+    if depth > DEEPEST:
+        return _odd()
+    parts = {key: shape.child(key) for key in shape.keys if key != "kind"}
+    fixed = {} if kind is None else {"kind": st.just(kind)}
+    names = st.lists(st.sampled_from(sorted(parts) or ["x"]), max_size=4, unique=True)
+
+    def some(chosen: list[str]) -> Any:
+        drawn = {name: _value(part, depth + 1) for name in chosen if (part := parts.get(name))}
+        return st.fixed_dictionaries({**fixed, **drawn})
+
+    return names.flatmap(some)
 
 
 def mutate(data: bytes, rng: random.Random, raw: Callable[[bytes, int], bytes]) -> bytes:
     """Set something at a key path of the document, if it is one."""
-    text = data.decode(errors="replace")
     try:
-        root, _ = read_document(text)
-    except Exception:
-        root = None
-    if root is None or not isinstance(root.value, dict):
+        whole: Any = json.loads(data)
+    except ValueError:
+        root, _ = read_document(data.decode(errors="replace"))
+        whole = root.plain() if root else None
+    if not isinstance(whole, dict):
         return bytes(raw(data, MAX_LEN))
-    whole: Any = root.plain()
     for _ in range(rng.randint(1, 3)):
         _change(whole, rng)
-    return json.dumps(whole).encode(errors="surrogatepass")
+    return json.dumps(whole).encode()
 
 
 def _change(here: Any, rng: random.Random) -> None:

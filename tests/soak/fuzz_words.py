@@ -23,8 +23,8 @@ VALUES = (
     "{kind: {}}", "[{kind: push, at: 0.1}]", "0x10", "0o7", "99999999999999999999", "1_000",
     "!!python/object:os.system x", "&a [*a]", "*b", "|\n x", "folder", "fifo", "/dev/zero",
     "/dev/stdin", "../..", "~root", "two_link", "paper.yaml", "a:B", "x.py:F", "\N{NO-BREAK SPACE}",
-    "\N{ZERO WIDTH NO-BREAK SPACE}1", "\N{ARABIC-INDIC DIGIT ONE}", "a: b", "? a", "- 1", "%YAML 1.1",
-    "---", "...", "2026-01-01", "1:30", "<<", "'", '"', "#", "@", "`",
+    "\N{ZERO WIDTH NO-BREAK SPACE}1", "\N{ARABIC-INDIC DIGIT ONE}", "a: b", "? a", "- 1",
+    "%YAML 1.1", "---", "...", "2026-01-01", "1:30", "<<", "'", '"', "#", "@", "`",
 )  # fmt: skip
 
 
@@ -48,24 +48,15 @@ def _paths(shape: Shape, path: str = "", depth: int = 0) -> Iterator[str]:
 
 
 PATHS = [*dict.fromkeys(_paths(Shape.of(Scenario))), "controller.from"]
+
+
+def _kinds() -> Iterator[str]:
+    """Every kind of anything."""
+    for path in PATHS:
+        part = Shape.root().at(tuple(path.split(".")), {})
+        yield from part.kinds if part else ()
+
+
 _KEYS = dict.fromkeys(key for path in PATHS for key in path.split("."))
-_KINDS = dict.fromkeys(
-    kind
-    for path in PATHS
-    if (part := Shape.root().at(tuple(path.split(".")), {}))
-    for kind in part.kinds
-)
-WORDS = [
-    *_KEYS,
-    *_KINDS,
-    *VALUES,
-    "controller.",
-    "plant.",
-    ".",
-    "=",
-    ": ",
-    "\n",
-    "\n  ",
-    "- ",
-    ", ",
-]
+_MARKS = ("controller.", "plant.", ".", "=", ": ", "\n", "\n  ", "- ", ", ")
+WORDS = [*_KEYS, *dict.fromkeys(_kinds()), *VALUES, *_MARKS]

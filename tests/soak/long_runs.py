@@ -9,10 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from mcap.records import Channel
 
 from dnnmso_mj import load_scenario, run_logged
 from dnnmso_mj.log.messages import Messages
-from dnnmso_mj.log.scan import scan
+from dnnmso_mj.log.prefix import Prefix
 from dnnmso_mj.log.step_message import StepFormat, layout_of
 from dnnmso_mj.logged import LoggedRun
 from dnnmso_mj.paths import find_model
@@ -38,7 +39,7 @@ from soak.tally import Form, Tally
 Array = np.ndarray
 
 NS_PER_S = 1_000_000_000
-# The paper's network goes on growing, and its loop diverges after some minutes, unless it is frozen.
+# The paper's network goes on growing, and its loop diverges after some minutes; not a frozen one.
 HOUR = ("paper", ("events=[{kind: freeze, at: 30.0}]",))
 INDEX_BYTES = 4.0  # a tick, of the log's index, which is written at its end
 KEPT_BYTES = 16.0  # a tick, of metrics: percentiles need all of a column
@@ -115,23 +116,23 @@ def check_times(log: Path, dt: float) -> int:
     Raises:
         AssertionError: t is not k·dt rounded once, or log_time not that in whole nanoseconds.
     """
-    done = 0
     period = round(dt * NS_PER_S)
     assert period == dt * NS_PER_S, f"dt = {dt}: no whole nanoseconds"
-
-    def take(messages: Messages) -> None:
-        nonlocal done
-        layout = layout_of(messages.data[0].tobytes())
-        ticks = np.arange(done, done + len(messages))
-        t = StepFormat(layout).decode(messages.data)[:, layout.slices["t"]][:, 0]
+    step, done = -1, 0
+    for record in Prefix(log):
+        if isinstance(record, Channel) and record.topic == "/step":
+            step = record.id
+        if not isinstance(record, Messages) or record.channel_id != step:
+            continue
+        layout = layout_of(record.data[0].tobytes())
+        ticks = np.arange(done, done + len(record))
+        t = StepFormat(layout).decode(record.data)[:, layout.slices["t"]][:, 0]
         wrong = np.flatnonzero(t != ticks * dt)
         assert not wrong.size, f"tick {ticks[wrong[0]]}: t = {float(t[wrong[0]])!r}"
-        ns = messages.time_ns.astype(np.int64)
-        wrong = np.flatnonzero((ns != ticks * period) | (messages.sequence != ticks))
+        ns = record.time_ns.astype(np.int64)
+        wrong = np.flatnonzero((ns != ticks * period) | (record.sequence != ticks))
         assert not wrong.size, f"tick {ticks[wrong[0]]}: log_time {ns[wrong[0]]} ns"
-        done += len(messages)
-
-    scan(log, take)
+        done += len(record)
     return done
 
 

@@ -1,4 +1,4 @@
-"""What keeps a machine busy: load on cores, memory and disk; bursts above a run's priority; stops."""
+"""What keeps a run from its machine: load, bursts above its priority, stops."""
 
 from __future__ import annotations
 
@@ -28,9 +28,11 @@ while True:
 """
 BURST = """
 import os, sys, time
-core, at, ms = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
+core, ms = int(sys.argv[1]), float(sys.argv[2])
 os.sched_setaffinity(0, {core})
 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(60))
+print("ready", flush=True)
+at = int(sys.stdin.readline())
 while (left := at - time.monotonic_ns()) > 0: time.sleep(left / 2e9)
 begin = now = time.monotonic_ns()
 while now < begin + ms * 1e6: now = time.monotonic_ns()
@@ -40,7 +42,7 @@ _DROP_FROM_BOUNDS, _SYS_NICE = 24, 23  # PR_CAPBSET_DROP, CAP_SYS_NICE
 
 
 def give_up_priority() -> None:
-    """In a child, before its program: no right to a better priority than everybody's."""
+    """Leave the program that this process becomes no better priority than everybody's."""
     ctypes.CDLL(None).prctl(_DROP_FROM_BOUNDS, _SYS_NICE, 0, 0, 0)
 
 
@@ -64,17 +66,25 @@ def load(folder: Path) -> Iterator[None]:
 
 def burst(ms: float) -> tuple[int, int]:
     """Take every core for so long, above any run's priority: from when to when all were taken."""
-    cores = sorted(os.sched_getaffinity(0))
-    at = time.monotonic_ns() + 400_000_000
     running = [
         subprocess.Popen(
-            [sys.executable, "-c", BURST, str(core), str(at), str(ms)],
+            [sys.executable, "-c", BURST, str(core), str(ms)],
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
         )
-        for core in cores
+        for core in sorted(os.sched_getaffinity(0))
     ]
-    times = [tuple(map(int, process.communicate(timeout=30)[0].split())) for process in running]
+    for process in running:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+    at = time.monotonic_ns() + 20_000_000
+    for process in running:
+        assert process.stdin is not None
+        process.stdin.write(f"{at}\n")
+        process.stdin.flush()
+    said = [process.communicate(timeout=30)[0].split() for process in running]
+    times = [(int(begin), int(end)) for begin, end in said]
     return max(begin for begin, _ in times), min(end for _, end in times)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from collections import defaultdict
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.records import Attachment, Channel
@@ -44,23 +46,27 @@ def untimed(row: Mapping[str, object]) -> dict[str, object]:
 
 
 def log_digest(log: Path) -> str:
-    """SHA-256 of a log's messages and attachments, but for the wall clock's bytes on /step."""
-    found, topics, masked = hashlib.sha256(), dict[int, str](), None
+    """SHA-256 of a log's messages and attachments, but for the wall clock's bytes on /step.
+
+    Each topic by itself: how many ticks come between two others' messages is of the wall clock too.
+    """
+    found: dict[str, Any] = defaultdict(hashlib.sha256)
+    topics, masked = dict[int, str](), None
     for record in Prefix(log):
         if isinstance(record, Channel):
             topics[record.id] = record.topic
         elif isinstance(record, Attachment):
-            found.update(f"{record.name} {record.log_time}".encode() + record.data)
+            found[record.name].update(str(record.log_time).encode() + record.data)
         elif isinstance(record, Messages):
-            data = record.data
-            if topics[record.channel_id] == "/step":
-                if masked is None:
-                    masked = _clocked_bytes(data[0].tobytes())
+            topic, data = topics[record.channel_id], record.data
+            if topic == "/step":
+                masked = _clocked_bytes(data[0].tobytes()) if masked is None else masked
                 data = np.where(masked, 0, data)
-            found.update(topics[record.channel_id].encode())
-            for part in (record.time_ns, record.sequence, data):
-                found.update(np.ascontiguousarray(part).tobytes())
-    return found.hexdigest()
+            parts = {"times": record.time_ns, "numbers": record.sequence, "data": data}
+            for name, part in parts.items():
+                found[f"{topic} {name}"].update(np.ascontiguousarray(part).tobytes())
+    whole = sorted((name, part.hexdigest()) for name, part in found.items())
+    return hashlib.sha256(repr(whole).encode()).hexdigest()
 
 
 def _clocked_bytes(message: bytes) -> np.ndarray:

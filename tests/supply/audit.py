@@ -40,9 +40,7 @@ class Audit:
         return self.audited > 0 and not self.findings and not self.unanswered
 
 
-def audit(
-    pins: Path = CONSTRAINTS, service: Sequence[str] = (), seconds: float = SECONDS
-) -> Audit:
+def audit(pins: Path = CONSTRAINTS, service: Sequence[str] = (), seconds: float = SECONDS) -> Audit:
     """Ask for known vulnerabilities of exact versions.
 
     Args:
@@ -54,9 +52,7 @@ def audit(
     command += ["--disable-pip", "--format", "json", "--progress-spinner", "off", "--desc", "off"]
     command += ["--timeout", str(ANSWER_SECONDS), *service]
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, timeout=seconds, check=False
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
     except subprocess.TimeoutExpired:
         return Audit(0, (), f"no answer of the advisory service within {seconds:g} s")
     try:

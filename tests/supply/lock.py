@@ -58,7 +58,13 @@ class Locked:
     @property
     def text(self) -> str:
         """As it stands in the file."""
-        return " \\\n".join([str(self.requirement), *(f"    --hash={h}" for h in self.hashes)]) + "\n"
+        lines = [str(self.requirement), *(f"    --hash={each}" for each in self.hashes)]
+        return " \\\n".join(lines) + "\n"
+
+    @property
+    def is_for_this_machine(self) -> bool:
+        """Whether the interpreter that runs this wants it."""
+        return self.requirement.marker is None or self.requirement.marker.evaluate()
 
 
 def lock_file(group: str) -> Path:
