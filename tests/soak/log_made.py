@@ -8,13 +8,14 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 
 import lz4.frame
 import numpy as np
 import zstandard
 from mcap.data_stream import RecordBuilder
-from mcap.records import Attachment, Chunk, McapRecord
+from mcap.records import Chunk, McapRecord
 
 from dnnmso_mj.log.format import EVENTS, STEP, event_message, scenario_record
 from dnnmso_mj.log.messages import Messages, pack, pack_one
@@ -186,10 +187,15 @@ def _filled(fill: Fill, text: str | None = None) -> Callable[[Path], None]:
     return lambda path: write(path, fill, text)
 
 
-def _spliced(*more: bytes) -> Callable[[Path], None]:
+def _late(fill: Callable[[], Fill]) -> Callable[[Path], None]:
+    """What is large is made when it is written."""
+    return lambda path: write(path, fill())
+
+
+def _spliced(more: Callable[[], bytes]) -> Callable[[Path], None]:
     def make(path: Path) -> None:
         write(path, give(steps(50)))
-        spliced(path, b"".join(more))
+        spliced(path, more())
 
     return make
 
@@ -217,35 +223,40 @@ def _numbers() -> dict[str, Callable[[Path], None]]:
     }
 
 
+def _compressing(times: int) -> bytes:
+    """Chunks of ticks that are all alike, numbered on from those before them."""
+    data = np.broadcast_to(steps(1), (20_000, steps(1).shape[1]))
+    order, zeros = np.arange(20_000), np.zeros(20_000)
+    parts = (Messages(1, zeros, order + 50 + 20_000 * k, data) for k in range(times))
+    return b"".join(chunk(pack(part)) for part in parts)
+
+
+def _channels() -> bytes:
+    bodies = (struct.pack("<BQHHIII", 4, 16, k, 0, 0, 0, 0) for k in range(3, 1000))
+    return b"".join(chunk(body * 1000) for body in bodies)
+
+
 def _chunks() -> dict[str, Callable[[Path], None]]:
-    same = pack(Messages(1, np.zeros(20_000), np.arange(50, 20_050), steps(20_000)))
-    many = b"".join(
-        chunk(pack(Messages(1, np.zeros(20_000), np.arange(20_000) + 50 + 20_000 * k, part)))
-        for k, part in enumerate([np.broadcast_to(steps(1), (20_000, steps(1).shape[1]))] * 20)
-    )
-    return {
-        "a chunk that claims 2^60 bytes": _spliced(chunk(b"", claims=GIANT)),
-        "a chunk that holds more than it claims": _spliced(chunk(bytes(200 * MB), claims=100)),
-        "a chunk of 200 MB of zeros": _spliced(chunk(bytes(200 * MB))),
-        "zeros in zstd": _spliced(
-            chunk(bytes(200 * MB), how="zstd"), chunk(bytes(9), claims=GIANT)
-        ),
-        "an unknown compression": _spliced(chunk(b"").replace(b"lz4", b"xyz")),
-        "ticks that compress well": _spliced(chunk(same)),
-        "many chunks that compress 100 times": _spliced(many),
-        "many chunks of zstd": _spliced(*[chunk(flood(2)[: 10 * MB], how="zstd")] * 400),
-        "messages that alternate": _spliced(*[chunk(flood(2))] * 8),
-        "messages of many sizes": _spliced(*[chunk(flood(40))] * 8),
-        "chunks in a chunk": _spliced(chunk(chunk(chunk(same)))),
-        "a giant string": _spliced(struct.pack("<BQI", 12, 24, 0xFFFFFFFF) + bytes(20)),
-        "a giant record": _spliced(struct.pack("<BQ", 12, GIANT)),
-        "a giant attachment": _spliced(
-            struct.pack("<BQQQIIQ", 9, 36, 0, 0, 0, 0, GIANT) + bytes(4)
-        ),
-        "channels without end": _spliced(
-            *[chunk(struct.pack("<BQHHIII", 4, 16, k, 0, 0, 0, 0) * 1000) for k in range(3, 1000)]
-        ),
+    giant = struct.pack("<BQQQIIQ", 9, 36, 0, 0, 0, 0, GIANT) + bytes(4)
+    made: dict[str, Callable[[], bytes]] = {
+        "a chunk that claims 2^60 bytes": lambda: chunk(b"", claims=GIANT),
+        "a chunk that holds more than it claims": lambda: chunk(bytes(200 * MB), claims=100),
+        "a chunk of 200 MB of zeros": lambda: chunk(bytes(200 * MB)),
+        "a chunk of zeros in zstd": lambda: chunk(bytes(200 * MB), how="zstd"),
+        "a chunk of zstd that claims 2^60 bytes": lambda: chunk(b"", claims=GIANT, how="zstd"),
+        "an unknown compression": lambda: chunk(b"").replace(b"lz4", b"xyz"),
+        "ticks that compress well": lambda: _compressing(1),
+        "many chunks that compress 100 times": lambda: _compressing(20),
+        "many chunks of zstd": lambda: chunk(flood(2)[: 10 * MB], how="zstd") * 400,
+        "messages that alternate": lambda: chunk(flood(2)) * 8,
+        "messages of many sizes": lambda: chunk(flood(40)) * 8,
+        "chunks in a chunk": lambda: chunk(chunk(chunk(bytes(MB)))),
+        "a giant string": lambda: struct.pack("<BQI", 12, 24, 0xFFFFFFFF) + bytes(20),
+        "a giant record": lambda: struct.pack("<BQ", 12, GIANT),
+        "a giant attachment": lambda: giant,
+        "channels without end": _channels,
     }
+    return {name: _spliced(more) for name, more in made.items()}
 
 
 def _metadata() -> dict[str, Callable[[Path], None]]:
@@ -277,46 +288,47 @@ def _metadata() -> dict[str, Callable[[Path], None]]:
 
 
 def _attachments() -> dict[str, Callable[[Path], None]]:
-    zeros = header("(8,)") + bytes(100 * MB)
-    data = {
-        "npz of 100 MB of zeros": npz(W=zeros),
-        "npz of Python objects": stored("W.npy", pickled()),
-        "npz of a giant shape": stored("W.npy", header("(1000000000000,)")),
-        "npz of a negative shape": stored("W.npy", header("(-1,)")),
-        "npz of nothing often": stored("W.npy", header("(10000000000,)", "'V0'")),
-        "npz of giant items": stored("W.npy", header("(1,)", "'V1000000000'")),
-        "npz of a deep header": stored("W.npy", header("(" * 900)),
-        "npz of no array": stored("W.txt", b"x"),
-        "npz of shared bytes": overlapping(),
-        "npz of a long directory": npz(**{f"{k:x}": b"" for k in range(20_000)}),
+    data: dict[str, Callable[[], bytes]] = {
+        "npz of 100 MB of zeros": lambda: npz(W=header("(8,)") + bytes(100 * MB)),
+        "npz of Python objects": lambda: stored("W.npy", pickled()),
+        "npz of a giant shape": lambda: stored("W.npy", header("(1000000000000,)")),
+        "npz of a negative shape": lambda: stored("W.npy", header("(-1,)")),
+        "npz of nothing often": lambda: stored("W.npy", header("(10000000000,)", "'V0'")),
+        "npz of giant items": lambda: stored("W.npy", header("(1,)", "'V1000000000'")),
+        "npz of a deep header": lambda: stored("W.npy", header("(" * 900)),
+        "npz of no array": lambda: stored("W.txt", b"x"),
+        "npz of shared bytes": overlapping,
+        "npz of a long directory": lambda: npz(**{f"{k:x}": b"" for k in range(20_000)}),
     }
     names = ["nan", "inf", "-1.0", "1e+308", "0.0/../../x", "\x00"]
-    made = {name: _filled(with_snapshot(content)) for name, content in data.items()}
+    made = {name: _late(lambda get=get: with_snapshot(get())) for name, get in data.items()}
     return made | {
         f"a snapshot of {t!r}": _filled(with_snapshot(b"x", f"snapshot/world/{t}.npz"))
         for t in names
     }
 
 
+def _odd() -> Fill:
+    ours = steps(30_000)
+    return give(np.concatenate([ours[:, 9:], ours[:, :9]], axis=1))  # t last
+
+
 def _messages() -> dict[str, Callable[[Path], None]]:
-    layout = StepLayout(n_joints=2, n_layers=4)
-    odd = np.concatenate([steps(30_000, layout)[:, 9:], steps(30_000, layout)[:, :9]], axis=1)
-    wide = b"\x12" + b"\xff\xff\xff\x07" + bytes(0x7FFFFF)
-    giant = np.frombuffer(b"\x12\x80\x80\x80\x04" + bytes(8 << 20), np.uint8)[None]
+    def one(data: bytes) -> Callable[[Path], None]:
+        return _late(lambda: give(np.frombuffer(data, np.uint8)[None]))
+
     return {
-        "laid out by another program": _filled(give(odd)),
-        "a million joints": _filled(give(giant)),
-        "a step that ends early": _filled(give(np.frombuffer(wide[:5000], np.uint8)[None])),
-        "events without end": _filled(events(3 * MB, "a")),
-        "a giant event": _filled(events(20, "a" * 8 * MB)),
-        "an event of the far future": _filled(events(3, "a", 9e12)),
+        "laid out by another program": _late(_odd),
+        "a million joints": one(b"\x12\x80\x80\x80\x04" + bytes(8 << 20)),
+        "a step that ends early": one(b"\x12\xff\xff\xff\x07" + bytes(5000)),
+        "events without end": _late(lambda: events(3 * MB, "a")),
+        "a giant event": _late(lambda: events(20, "a" * 8 * MB)),
+        "an event of the far future": _late(lambda: events(3, "a", 9e12)),
         "no such topic": lambda path: write(path, give(steps(9)), topic="/other"),
     }
 
 
+@cache
 def makers() -> dict[str, Callable[[Path], None]]:
     """What writes each of these logs to a path."""
     return {**_numbers(), **_chunks(), **_metadata(), **_attachments(), **_messages()}
-
-
-__all__ = ["Attachment", "makers"]
