@@ -71,9 +71,9 @@ HISTORY = (0, 1000)  # samples that a sensor or a motor keeps
 
 # Attributes that are refused wherever they stand, and what to do instead.
 FORBIDDEN = {
-    "content_type": "remove it; the file's ending says what it is",
-    "passthrough": "remove it; files become a part of the model",
-    "embed": "remove it; files become a part of the model",
+    "content_type": "allowed: none; the file's ending says what it is",
+    "passthrough": "allowed: none; files become a part of the model",
+    "embed": "allowed: none; files become a part of the model",
 }
 FORBIDDEN_VALUES = {"sdf": "mesh, capsule, box …", "muscle": "motors"}
 
