@@ -44,14 +44,16 @@ def put_back(text: str, files: Mapping[str, bytes], folder: Path) -> Mjcf:
         ScenarioError: a file's name can be none in a folder, or the model is refused.
     """
     root = _root(text)
-    for number, (element, key, path) in enumerate(list(named(root))):
+    numbers: dict[str, int] = {}  # a file is written once, however often it is named
+    for element, key, path in list(named(root)):
         data = files.get(PREFIX + path)
         if data is not None:
+            number = numbers.setdefault(path, len(numbers))
             name = f"{number}/{_file_name(path)}"  # which may name the element
             file = folder / name
-            file.parent.mkdir(exist_ok=True)
-            with file.open("xb") as stream:
-                stream.write(data)
+            if not file.exists():
+                file.parent.mkdir()
+                file.write_bytes(data)
             element.set(key, name)
     if not any(folder.iterdir()):
         return Mjcf(text)
@@ -66,8 +68,8 @@ def _file_name(path: str) -> str:
     name = Path(path).name
     if name in {"", ".", ".."} or not name.isprintable() or len(name.encode()) > LONGEST_NAME:
         raise ScenarioError(
-            f"the model of a log names the file {show(path)}; allowed: the name of a file, of at "
-            f"most {LONGEST_NAME} bytes"
+            f"plant.model: the MJCF of a log names the file {show(path)}; allowed: the name of a "
+            f"file, of at most {LONGEST_NAME} bytes"
         )
     return name
 

@@ -34,28 +34,42 @@ def why_it_ended(world: World, layout: StepLayout) -> NonFiniteError:
         world: whose status is neither RUNNING nor SAFELY_STOPPED.
         layout: of its rows.
     """
-    status, tau = world.counts[STATUS], world.actuators.tau.tolist()
-    name = "the watchdog's tau" if world.counts[MISSED] else "tau"
-    if status == TAU_NOT_FINITE:
-        return NonFiniteError(name, tau)
-    if status == TAU_TOO_LARGE:
-        return NonFiniteError(name, f"{tau}, above {MUJOCO_ZEROES_ABOVE:g}")
+    far = _far_state(world)
+    if far is not None:
+        return far
+    status, above = world.counts[STATUS], f"above {MUJOCO_ZEROES_ABOVE:g}"
+    if status in {TAU_NOT_FINITE, TAU_TOO_LARGE}:
+        name, tau = "the watchdog's tau" if world.counts[MISSED] else "tau", world.actuators.tau
+        large = f", {above}" if status == TAU_TOO_LARGE else ""
+        return NonFiniteError(name, f"{tau.tolist()}{large}")
     if status == LOAD_TOO_LARGE:
-        torque = world.loads.torque.tolist()
         return NonFiniteError(
-            "torque beside the motors'", f"{torque}, above {MUJOCO_ZEROES_ABOVE:g}"
+            "torque beside the motors'", f"{world.loads.torque.tolist()}, {above}"
         )
-    if status == STATE_NOT_FINITE:
-        return _of_state(np.concatenate([world.plant.q, world.plant.qd]), "")
-    if status == READING_NOT_FINITE:
-        return _of_state(world.inputs.x, "_meas")
+    if status in {STATE_NOT_FINITE, READING_NOT_FINITE}:
+        return _of_state(world)
     return _of_row(world, layout)
 
 
-def _of_state(x: Array, suffix: str) -> NonFiniteError:
-    q, qd = np.split(x, 2)
-    name, values = ("qd", qd) if np.isfinite(q).all() else ("q", q)
-    return NonFiniteError(name + suffix, values.tolist())
+def _told(world: World) -> dict[str, Array]:
+    q_meas, qd_meas = np.split(world.inputs.x, 2)
+    return {"q": world.plant.q, "qd": world.plant.qd, "q_meas": q_meas, "qd_meas": qd_meas}
+
+
+def _far_state(world: World) -> NonFiniteError | None:
+    """A true state, or else a reading, where no arm is: all else that is wrong comes of it."""
+    for name, values in _told(world).items():
+        largest = float(np.abs(values).max())
+        if DIVERGED_ABOVE < largest < np.inf:
+            return NonFiniteError(f"|{name}|", f"{largest:.4g}, above {DIVERGED_ABOVE:g}")
+    return None
+
+
+def _of_state(world: World) -> NonFiniteError:
+    """The angles or velocities that are no numbers, true ones before readings."""
+    named = _told(world)
+    name = next(name for name, values in named.items() if not np.isfinite(values).all())
+    return NonFiniteError(name, named[name].tolist())
 
 
 def _of_row(world: World, layout: StepLayout) -> NonFiniteError:
@@ -65,7 +79,7 @@ def _of_row(world: World, layout: StepLayout) -> NonFiniteError:
     row = world.rows[counts[ROWS] - int(not left_out)]
     fields = {name: row[where] for name, where in layout.slices.items()}
     for name, values, most in (
-        *((name, fields[name], DIVERGED_ABOVE) for name in ("q", "qd", "x_hat")),
+        ("x_hat", fields["x_hat"], DIVERGED_ABOVE),
         ("qdd", world.plant.qacc, QDD_ABOVE),
     ):
         largest = float(np.abs(values).max())

@@ -139,8 +139,8 @@ def packaged_model(name: str) -> Path | None:
 
     Args:
         name: "package:file.xml", of a file in the package's folder ("package.folder:file.xml" in
-            one below it), or the name of an entry point of the group `MODELS` with such a value.
-            Nothing is imported: a robot is data.
+            one below it) and not out of it, or the name of an entry point of the group `MODELS`
+            with such a value. Nothing is imported: a robot is data.
     """
     if ":" not in name:
         points = list(entry_points(group=MODELS, name=name))
@@ -154,8 +154,10 @@ def packaged_model(name: str) -> Path | None:
     except ValueError:  # a module that runs or was made by hand, as __main__
         return None
     folders = (spec.submodule_search_locations if spec else None) or ()
-    paths = (Path(folder, *below, file.strip()) for folder in folders)
-    return next((path.resolve() for path in paths if _is_file(path)), None)
+    homes = (Path(folder, *below).resolve() for folder in folders)
+    paths = ((home, home / file.strip()) for home in homes if "\0" not in file)
+    inside = (path.resolve() for home, path in paths if path.resolve().is_relative_to(home))
+    return next((path for path in inside if _is_file(path)), None)
 
 
 def find_controller(name: str, base: Path) -> Path:

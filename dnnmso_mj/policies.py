@@ -175,7 +175,8 @@ def _onnx(data: bytes, name: str, zeros: Array, n_outputs: int) -> Act:
         session = onnxruntime.InferenceSession(data, options, ["CPUExecutionProvider"])
     except Exception as error:  # of its own making, each derived from Exception alone
         raise ScenarioError(
-            f"{name}: onnxruntime cannot read it: {_first_line(error)}; allowed: an ONNX model in one file"
+            f"{name}: onnxruntime cannot read it: {_first_line(error)}; allowed: an ONNX model, "
+            "its weights in it"
         ) from error
     inputs = session.get_inputs()
     shape = inputs[0].shape if inputs else []

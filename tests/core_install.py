@@ -1,7 +1,8 @@
 """No tests: an installation of the core alone, made of links to what is installed here.
 
 A real virtual environment, in which there is nothing but what the core asks for, what that asks for
-in turn, and this package's own metadata; its code is the one that is tested, so that compiled loops serve.
+in turn, and this package's own metadata; its code is what the tests import, so that compiled loops
+serve.
 """
 
 from __future__ import annotations

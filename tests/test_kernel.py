@@ -67,9 +67,7 @@ def printed_madam(
 def test_three_updates_are_madam_as_printed(shape, precision, eta, eta_max):
     """The first ratio, 1/√(1−β), is beyond the clamp if it is 2, as long as it is not corrected."""
     for corrected in (False, True):
-        spec = Madam(
-            eta=eta, eta_max=eta_max, sigma_max=0.5, beta=0.9, bias_correction=corrected
-        )
+        spec = Madam(eta=eta, eta_max=eta_max, sigma_max=0.5, beta=0.9, bias_correction=corrected)
         w, _, _ = sample(shape)
         w = w.astype(precision)
         net, v = build_net(shape, w, spec), np.zeros_like(w, float)

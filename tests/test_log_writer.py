@@ -31,7 +31,7 @@ from mcap.records import (
 from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
-from dnnmso_mj import __version__ as VERSION
+from dnnmso_mj import __version__
 from dnnmso_mj.log.background import Background
 from dnnmso_mj.log.messages import HEADER_SIZE, RECORD, Messages, pack, pack_one, unpack
 from dnnmso_mj.log.writer import CHUNK_BYTES, LogWriter
@@ -245,7 +245,10 @@ def written() -> bytes:
     writer.add_metadata("one", {"key": "value"})
     writer.add_attachment(7, "first.bin", "application/x-first", b"123")
     schema = writer.add_schema("Thing", "jsonschema", b"{}")
-    channels = [writer.add_channel(f"/{name}", "json", id) for name, id in zip("ab", (schema, 0), strict=True)]
+    channels = [
+        writer.add_channel(f"/{name}", "json", id)
+        for name, id in zip("ab", (schema, 0), strict=True)
+    ]
     other = writer.add_schema("Other", "protobuf", b"other")
     writer.add_channel("/unused", "protobuf", other)
     writer.add_message(channels[0], 500, b"{}")
@@ -266,7 +269,11 @@ def test_a_file_begins_with_who_wrote_it(written: bytes) -> None:
     header = Header.read(stream)
     assert written.startswith(MCAP0_MAGIC)
     assert written.endswith(MCAP0_MAGIC)
-    assert (opcode, header.profile, header.library) == (Opcode.HEADER, "", f"dnnmso_mj {VERSION}")
+    assert (opcode, header.profile, header.library) == (
+        Opcode.HEADER,
+        "",
+        f"dnnmso_mj {__version__}",
+    )
 
 
 def test_schemas_and_channels_come_back_as_they_were_given(written: bytes) -> None:
@@ -294,10 +301,13 @@ def test_messages_come_back_with_their_times_from_any_reader(written: bytes) -> 
 
 
 def test_each_index_says_where_and_what_its_record_is(written: bytes) -> None:
-    before, footer = parts_of(written)
+    before, _ = parts_of(written)
     summary = make_reader(io.BytesIO(written)).get_summary()
     kinds = {
-        Opcode.CHUNK: (Chunk, [(c.chunk_start_offset, c.chunk_length) for c in summary.chunk_indexes]),
+        Opcode.CHUNK: (
+            Chunk,
+            [(c.chunk_start_offset, c.chunk_length) for c in summary.chunk_indexes],
+        ),
         Opcode.ATTACHMENT: (Attachment, [(a.offset, a.length) for a in summary.attachment_indexes]),
         Opcode.METADATA: (Metadata, [(m.offset, m.length) for m in summary.metadata_indexes]),
     }

@@ -125,7 +125,7 @@ def test_lines_in_messages_of_mujoco_are_those_of_the_file() -> None:
         (world('<geom size="1e999"/>'), "out of range; allowed: -1e"),
         (world(f'<geom size="1{"0" * 300}"/>'), "out of range"),
         *(
-            (world(before=f'<option timestep="{value}"/>'), r"timestep = .*allowed: (1e-06 to 1|finite)")
+            (world(before=f'<option timestep="{value}"/>'), r"timestep = .*allowed: (1e-06|finite)")
             for value in ("0", "-1", "nan", "inf", "1e9", "", "x")
         ),
         (world(before='<option iterations="2000000000"/>'), "iterations = .*allowed: 0 to 10000"),
@@ -177,6 +177,10 @@ CONTENTS = {
     + b"..",
     "faces.stl": b"\0" * 80 + struct.pack("<I", 100_001) + TRIANGLE * 100_001,
     "nan.obj": b"v 0 0 0\nv nan 0 0\nf 1 1 1\n",
+    "space.obj": b"v 0 0 0\r  v 0 1e+99 0\nf 1 1 1\n",
+    "polygon.obj": b"v 0 0 0\nf" + b" 1" * 100_000,
+    "polygons.obj": b"v 0 0 0\n" + (b"f" + b" 1" * 400 + b"\n") * 300,
+    "lines.obj": b"vn 0 0 1\n" * 600_000,
     "lies.msh": struct.pack("<4i", 2**31 - 1, 0, 0, 4),
     "index.msh": struct.pack("<4i", 1, 0, 0, 1) + struct.pack("<3f3i", 0, 0, 0, 0, 0, 7),
     "bomb.png": png(4, 4, b"\0" * 10_000_000),
@@ -199,6 +203,12 @@ def test_files_that_mujoco_would_choke_on_are_refused(name: str, tmp_path: Path)
 
 
 def test_good_files_are_let_in(tmp_path: Path) -> None:
+    solid = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1.000000e+00\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "a.obj").write_text(solid)
+    (tmp_path / "solid.xml").write_text(
+        world('<geom type="mesh" mesh="a"/>', '<asset><mesh file="a.obj"/></asset>')
+    )
+    assert compiled(Mjcf.read(tmp_path / "solid.xml")).nmesh == 1
     (tmp_path / "a.stl").write_bytes(b"\0" * 80 + struct.pack("<I", 1) + TRIANGLE)
     (tmp_path / "a.png").write_bytes(png(4, 4, b"\0" * 52))
     asset = '<asset><mesh name="a" file="a.stl"/><texture type="2d" name="a" file="a.png"/></asset>'

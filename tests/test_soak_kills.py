@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import threading
 import time
 from dataclasses import replace
 
@@ -13,10 +16,13 @@ from soak.killed_sweeps import Reporter, check_rows
 from soak.kills import many
 from soak.proof import prove
 from soak.tally import Tally
+from sweep_samples import children
 
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.run import run_logged
 from dnnmso_mj.sweep.journal import journal_path
+from dnnmso_mj.sweep.local import LocalEngine
+from dnnmso_mj.sweep.plan import plan_sweep
 
 
 @pytest.mark.alone
@@ -89,3 +95,23 @@ def test_a_row_that_was_called_safe_and_is_not_there_is_lost(tmp_path):
     journal_path(out).unlink()
     with pytest.raises(AssertionError, match="3 of 3 finished rows are lost"):
         check_rows(out, told)
+
+
+def test_a_worker_that_is_killed_before_it_is_ready_is_started_once_more():
+    plan = plan_sweep("paper", range(2), ["duration=0.05"])
+    killed = []
+
+    def end_one() -> None:
+        workers = [pid for pid in children(os.getpid()) if pid not in others]
+        if not workers:  # none is started yet
+            threading.Timer(0.01, end_one).start()
+            return
+        os.kill(workers[-1], signal.SIGKILL)
+        killed.append(workers[-1])
+
+    others = set(children(os.getpid()))
+    threading.Timer(0.0, end_one).start()
+    rows = list(LocalEngine(1).rows(plan.tasks([set()])))
+    assert len(killed) == 1
+    assert sorted(row["seed"] for row in rows) == [0, 1]
+    assert {row["status"] for row in rows} == {"ok"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 
 import pytest
 from soak import write_errors
@@ -13,6 +14,8 @@ from dnnmso_mj.errors import UnloggedRunError
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.reading import read_trace
 from dnnmso_mj.run import run_logged
+from dnnmso_mj.tuning import TuneError
+from dnnmso_mj.tuning.study import Study
 
 
 @pytest.mark.alone
@@ -87,8 +90,18 @@ def test_a_run_whose_log_is_taken_away_has_its_metrics_still(tmp_path):
 
     with pytest.raises(UnloggedRunError, match="was moved or removed") as failed:
         run_logged(scenario, out, progress=remove)
-    trace = failed.value.trace
-    assert (trace.info.status, len(trace)) == ("failed", scenario.n_ticks)
+    run = failed.value.run
+    assert (run.info.status, run.ticks) == ("failed", scenario.n_ticks)
     whole = run_logged(scenario, tmp_path / "whole.mcap")
-    assert trace.info.metrics["rmse"] == whole.trace.info.metrics["rmse"]
+    assert run.info.metrics["rmse"] == whole.info.metrics["rmse"]
     assert read_trace(whole.log).info.status == "ok"
+
+
+def test_a_study_that_cannot_be_written_is_one_error_that_names_it(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, before[1]))
+    try:
+        with pytest.raises(TuneError, match=r"pd\.db: cannot be written: .+--resume goes on"):
+            Study(tmp_path / "pd.db", "pd", {}, {}, {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

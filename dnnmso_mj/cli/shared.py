@@ -65,7 +65,7 @@ Overrides = Annotated[
     ),
 ]
 Trust = Annotated[
-    bool, typer.Option("--trust", help="Run code that the scenario names (keys `python`).")
+    bool, typer.Option("--trust", help="Run code that the scenario names, and read files anywhere.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
 

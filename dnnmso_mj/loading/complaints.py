@@ -12,6 +12,8 @@ from pydantic_core import ErrorDetails
 from dnnmso_mj.loading.shape import ABSENT, Shape, lookup
 from dnnmso_mj.wording import KeyPath, did_you_mean, dotted, show
 
+MAX_EXPLAINED = 500  # of thousands, those that are told are enough; each takes time to put in words
+
 _KINDS = {
     bool: "is true or false",
     int: "is a whole number",
@@ -58,7 +60,10 @@ def explain(error: ValidationError, data: Any, root: Shape | None = None) -> lis
     """
     root = root or Shape.root()
     out: list[Complaint] = []
-    for detail in error.errors(include_url=False, include_input=False):
+    details = error.errors(include_url=False, include_input=False)
+    if len(details) > MAX_EXPLAINED:
+        out.append(Complaint((), f"{len(details)} problems; allowed: none; here are some"))
+    for detail in details[:MAX_EXPLAINED]:
         path = _key_path(detail["loc"], data, root)
         problems = detail.get("ctx", {}).get("problems")
         if problems is None:

@@ -21,8 +21,9 @@ from dnnmso_mj.loading.complaints import Complaint, complain
 from dnnmso_mj.loading.documents import read_document
 from dnnmso_mj.loading.shape import ABSENT, Shape, lookup
 from dnnmso_mj.loading.trust import anchored
-from dnnmso_mj.wording import KeyPath, clean, dotted, show
+from dnnmso_mj.wording import KeyPath, clean, dotted, shorten, show
 
+LONGEST = 300  # characters of an override that are told whole
 FORM = "allowed: KEY.PATH=VALUE, as in plant.gravity=1.62"
 
 
@@ -37,7 +38,7 @@ class Override:
     @property
     def place(self) -> str:
         """How messages call it."""
-        return f"--set {clean(self.text)}"
+        return _place(self.text)
 
     def covers(self, path: KeyPath) -> bool:
         """Whether the value at `path` came from here."""
@@ -68,9 +69,13 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> list
     return complaints + list(_drop_foreign(Shape.root(), data, before, (), overrides))
 
 
+def _place(text: str) -> str:
+    return f"--set {clean(text if len(text) <= LONGEST else shorten(text))}"
+
+
 def _parse(text: str) -> Override | str:
     """The override, or what is wrong with it."""
-    place = f"--set {clean(text)}"
+    place = _place(text)
     keys, equals, value = text.partition("=")
     path = tuple(key.strip() for key in keys.split("."))
     if not equals:

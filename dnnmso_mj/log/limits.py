@@ -26,12 +26,12 @@ def contents(size: int) -> int:
 
 def runs(size: int) -> int:
     """How many stretches of messages of one kind; ours have a few in each 50 ms."""
-    return 10_000 + size // 4
+    return 10_000 + size // 16
 
 
 def rows(size: int) -> int:
-    """Bytes of numbers; those of runs take up to three times what they take in the file."""
-    return 40 * MIB + 8 * size
+    """Bytes of numbers; those of runs take up to twice what they take in the file."""
+    return 24 * MIB + 7 * size
 
 
 def events(size: int) -> int:
@@ -44,7 +44,7 @@ EVENT = 256
 
 def odd_steps(size: int) -> int:
     """Messages on /step that another program laid out, and which are read one by one."""
-    return 5_000 + size // 32
+    return 5_000 + size // 64
 
 
 def too_much(path: Path, what: str, most: int, size: int) -> LogError:

@@ -113,10 +113,10 @@ class _Walk:
             case Opcode.CHANNEL:
                 yield from self._checked(records.channel(body))
             case Opcode.METADATA:
-                record = records.metadata(body)
+                records.check_metadata(body)
                 self._metadata += len(body)
                 self._allow("bytes of metadata", self._metadata, limits.METADATA)
-                yield record
+                yield records.metadata(body)
             case Opcode.ATTACHMENT:
                 yield records.attachment(body)
             case _:

@@ -103,6 +103,14 @@ def metadata(body: bytes | memoryview) -> Metadata:
     return found
 
 
+def check_metadata(body: bytes | memoryview) -> None:
+    """Refuse what is no record of the kind Metadata, without reading its entries."""
+    fields = Fields(body)
+    fields.take(fields.number(4))
+    fields.take(fields.number(4))
+    fields.end()
+
+
 def attachment(body: bytes | memoryview) -> Attachment:
     """A record of the kind Attachment, its checksum compared."""
     fields = Fields(body)

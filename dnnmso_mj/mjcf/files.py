@@ -26,8 +26,9 @@ MAX_HULL_FACES = 20_000  # the same, where the inertia is that of convex hulls
 FOLDERS = {"mesh": "meshdir", "hfield": "meshdir", "texture": "texturedir"}
 ALLOWED = "allowed: a file in the model's folder or below, named from there"
 
+MAX_LINE = 1000  # characters of an OBJ's line
 _ODD_VERTEX = re.compile(
-    rb"^v[^\n]*(nan|inf|e\+?0*[1-9]\d|(?<![.\d])\d{11})", re.IGNORECASE | re.MULTILINE
+    rb"^[ \t]*v[^\n]*?(nan|inf|e\+?0*[1-9]\d|(?<![.\d])\d{11})", re.IGNORECASE | re.MULTILINE
 )
 
 
@@ -182,9 +183,14 @@ def _stl(data: bytes) -> int | None:
 
 
 def _obj(data: bytes) -> int | None:
-    if _ODD_VERTEX.search(data):
+    """Triangles, or lines where there are more than five for each."""
+    data = data.replace(b"\r", b"\n")
+    if data.count(b"\n") > 5 * MAX_FACES:
+        return data.count(b"\n")
+    lines = data.split(b"\n")
+    if max(map(len, lines)) > MAX_LINE or _ODD_VERTEX.search(data):
         return None
-    return max(data.count(b"\nf"), data.count(b"\nv "))
+    return sum(len(line.split()) - 3 for line in lines if line.lstrip()[:1] == b"f")
 
 
 def _msh(data: bytes) -> int | None:

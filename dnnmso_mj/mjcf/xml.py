@@ -18,6 +18,7 @@ from dnnmso_mj.wording import clean, show
 MAX_BYTES = 2 * 1024 * 1024  # of an MJCF, its includes counted
 MAX_DEPTH = 200
 MAX_ELEMENTS = 5000  # as they are written; `rules` counts copies too
+MAX_ATTRIBUTES = 100  # of an element
 MAX_WORD = 512  # characters between two spaces of an attribute
 
 SPACES = re.compile(r"[\t\n\r]")
@@ -109,6 +110,8 @@ class _Reader:
             raise self._error(line, f"nested too deeply; allowed: {MAX_DEPTH} levels")
         if self._count > MAX_ELEMENTS:
             raise self._error(line, f"too many elements; allowed: {MAX_ELEMENTS}")
+        if len(attributes) > MAX_ATTRIBUTES:
+            raise self._error(line, f"too many attributes; allowed: {MAX_ATTRIBUTES} of an element")
         self._builder.data("\n" * (line - self._line))
         self._line = line
         tag = cast("Tag", self._builder.start(name, attributes))

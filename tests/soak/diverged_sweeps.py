@@ -48,17 +48,17 @@ class Faulty:
         self.tick += 1
         return tau
 '''
-TICKS = 200
+LAW = "controller: {kind: external, python: 'laws.py:Faulty', settings: {mode: nan}}\n"
 SHORT = ["duration=0.2"]
 # An observer of the printed sign, a joint past its limit in some seeds, gains beyond the drives.
 AXES = (
     (["controller.observer.K2=300", *SHORT], ["controller.observer.feedback=stable,as_printed"]),
     (
-        ["controller={kind: pd}", "imperfections.position_noise=0.02", *SHORT],
+        ["controller.kind=pd", "imperfections.position_noise=0.02", *SHORT],
         ["safety.qd_max=null,2.5,4.0"],
     ),
     (
-        ["controller={kind: no_network}", "imperfections.torque_limit=30", "duration=1"],
+        ["controller.kind=no_network", "imperfections.torque_limit=30", "duration=1"],
         ["imperfections.actuator_delay=0.0,0.06", "controller.inversion.K=7.5,150.0"],
     ),
 )
@@ -82,10 +82,10 @@ def run(form: Form, tally: Tally, folder: Path) -> None:
 
 
 def _plans(folder: Path, seeds: Sequence[int], form: Form) -> list[Plan]:
-    law = {"kind": "external", "python": f"{folder}/laws.py:Faulty", "settings": {"mode": "nan"}}
-    outside = [f"controller={json.dumps(law)}", *SHORT]
+    outside = folder / "outside.yaml"
+    outside.write_text(f"name: outside\nreference: {{kind: sinusoid, phase: [0.0, 1.5]}}\n{LAW}")
     grid = ["controller.settings.mode=nan,inf,huge"]
-    plans = [plan_sweep("paper", seeds, outside, grid, trust=True)]
+    plans = [plan_sweep(outside, seeds, SHORT, grid, trust=True)]
     for sets, axes in AXES[: form.pick(2, len(AXES))]:
         plans.append(plan_sweep("paper", list(seeds)[: form.pick(4, 24)], sets, axes))
     return plans
@@ -173,9 +173,7 @@ def _check_statistics(point: Any, rows: list[dict[str, Any]]) -> None:
 def _compared(folder: Path, seeds: Sequence[int], tally: Tally) -> int:
     """A comparison in which one controller diverges in some seeds."""
     faulty = folder / "faulty.yaml"
-    faulty.write_text(
-        "controller: {kind: external, python: 'laws.py:Faulty', settings: {mode: nan}}\n"
-    )
+    faulty.write_text(LAW)
     names = ("pd", str(faulty))
     plan = plan_comparison("paper", names, seeds, SHORT, trust=True)
     table = run_sweep(plan, folder / "compared.parquet", LocalEngine(2)).table

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -123,7 +124,7 @@ def _force(simulation: Simulation, fault: Fault) -> None:
     loads = simulation.stage.world.loads
     if not loads.acting:
         _into(loads.torque, fault)
-    elif loads.dry and fault.entry < 0.3:
+    elif loads.dry and fault.entry < 0.3 and not math.isfinite(fault.value):  # a guess at it
         _into(loads.held[FRICTION], fault)
     else:
         _into(loads.push[: loads.torque.size], fault)

@@ -1,17 +1,18 @@
 """`dnnmso run --real-time` in a process that stamps what happens: an account that is not its own.
 
-    python -m soak.observed FOLDER [--overrun '{"TICK": MS}'] -- ARGUMENTS OF dnnmso run
+    python -m soak.observed FOLDER [--ordinary] [--overrun '{"TICK": MS}'] -- ARGUMENTS OF RUN
 
 FOLDER/start.txt says when tick 0 is due (ns of the monotonic clock), as soon as that is settled.
-With --overrun the controller is one in Python, which computes too long at those ticks, and
-FOLDER/stamps.npy has four times of each tick: before and after it was waited for and sensed, before
-and after its command was acted on.
+With --ordinary the run has no right to a better priority than others. With --overrun the controller
+is one in Python, which computes too long at those ticks, and FOLDER/stamps.npy has four times of
+each tick: before and after it was waited for and sensed, before and after its command was acted on.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -24,6 +25,7 @@ from dnnmso_mj.__main__ import main
 from dnnmso_mj.controllers import Command, Inputs
 from dnnmso_mj.simulation import Simulation
 from dnnmso_mj.tick import START_NS
+from soak.pressure import give_up_priority
 
 START, STAMPS = "start.txt", "stamps.npy"
 
@@ -92,8 +94,13 @@ def observe() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--overrun", type=json.loads)
+    parser.add_argument("--ordinary", action="store_true")
     split = sys.argv.index("--")
     ours, theirs = parser.parse_args(sys.argv[1:split]), sys.argv[split + 1 :]
+    if ours.ordinary:  # such a right ends with the program that had it
+        give_up_priority()
+        words = [word for word in sys.argv[1:] if word != "--ordinary"]
+        os.execv(sys.executable, [sys.executable, "-m", "soak.observed", *words])
     Observed.folder = ours.folder
     kept: list[np.ndarray] = []
 

@@ -20,7 +20,7 @@ from dnnmso_mj.reading import read_trace
 from dnnmso_mj.trace import Trace
 from soak import accounts
 from soak.observed import STAMPS, START
-from soak.pressure import burst, can_burst, give_up_priority, load, stop
+from soak.pressure import burst, can_burst, load, stop
 from soak.tally import Form, Tally
 
 TESTS = Path(__file__).parents[1]
@@ -63,6 +63,7 @@ class Paced:
         """The process and when its tick 0 is due; waited for at the end."""
         folder.mkdir()
         words = [sys.executable, "-m", "soak.observed", str(folder)]
+        words += ["--ordinary"] if self.ordinary else []
         if self.overrun is not None:
             words += ["--overrun", json.dumps(self.overrun)]
         sets = {
@@ -74,10 +75,7 @@ class Paced:
         words += ["--", "paper", "--real-time", "--no-plot", "--json", "--out", "run.mcap"]
         words += [word for key, value in sets.items() for word in ("--set", f"{key}={value}")]
         with (folder / "out.json").open("w") as out, (folder / "err.txt").open("w") as err:
-            process = subprocess.Popen(
-                words, cwd=folder, stdout=out, stderr=err, text=True,
-                preexec_fn=give_up_priority if self.ordinary else None,
-            )  # fmt: skip
+            process = subprocess.Popen(words, cwd=folder, stdout=out, stderr=err, text=True)
         try:
             yield process, _start(folder, process)
             process.wait(self.duration + 60)

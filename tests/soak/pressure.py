@@ -1,4 +1,4 @@
-"""What keeps a machine busy: load on cores, memory and disk; bursts above a run's priority; stops."""
+"""What keeps a run from its machine: load, bursts above its priority, stops."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _DROP_FROM_BOUNDS, _SYS_NICE = 24, 23  # PR_CAPBSET_DROP, CAP_SYS_NICE
 
 
 def give_up_priority() -> None:
-    """In a child, before its program: no right to a better priority than everybody's."""
+    """Leave the program that this process becomes no better priority than everybody's."""
     ctypes.CDLL(None).prctl(_DROP_FROM_BOUNDS, _SYS_NICE, 0, 0, 0)
 
 

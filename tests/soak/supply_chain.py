@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -14,9 +15,9 @@ from pathlib import Path
 from core_install import closure
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from supply import artifacts, audit, environment, licences, lock, sbom
 
 from soak.tally import Form, Tally
-from supply import artifacts, audit, environment, licences, lock, sbom
 
 ROOT = Path(__file__).parents[2]
 LOCK_LINE = re.compile(
@@ -34,8 +35,9 @@ PLANTED = (
 NOT_FROM_A_WHEEL = (
     "--ignore-glob=tests/test_soak*",
     "--deselect=tests/test_paths.py::test_an_installed_wheel_finds_its_models_and_scenarios",
+    "--deselect=tests/test_paths.py::test_a_checkout_has_models_and_scenarios_at_its_top",
 )
-TELLING = ("tests/test_loading.py", "tests/test_paths.py", "tests/test_scenarios.py")
+TELLING = ("tests/test_paths.py", "tests/test_links.py", "tests/test_reference.py")
 
 
 def own_requirements() -> dict[str, list[str]]:
@@ -254,6 +256,21 @@ def suite(tally: Tally, tree: Path, python: Path, *what: str, warm: bool) -> Non
         tally.lose(f"pytest ended with status {done.returncode}: {last or done.stderr[-200:]}")
 
 
+def runs(tree: Path, python: Path) -> None:
+    """A run, by the installed wheel alone, of what ships in it."""
+    command = [str(python), "-m", "dnnmso_mj", "run", "paper_no_network", "--json", "--no-plot"]
+    env = environment.clean_environment()
+    done = subprocess.run(
+        [*command, "--set", "duration=0.1"],
+        cwd=tree.parent,
+        env=env,
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr.decode()[-300:]
+    assert json.loads(done.stdout)["status"] == "ok"
+
+
 def run(form: Form, tally: Tally, folder: Path) -> None:
     """See the module."""
     lock_is_complete(tally)
@@ -283,3 +300,5 @@ def run(form: Form, tally: Tally, folder: Path) -> None:
         tree = without_sources(sdist, folder)
         python = environment.overlay(folder / "venv", wheel)
         suite(tally, tree, python, *TELLING, warm=False)
+        with tally.case("a run of the installed wheel"):
+            runs(tree, python)

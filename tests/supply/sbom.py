@@ -34,7 +34,10 @@ def differences(sbom: Mapping[str, Any], installed: Mapping[str, str]) -> list[s
     if sbom.get("bomFormat") != "CycloneDX":
         return ["not a CycloneDX bill"]
     root = sbom["metadata"]["component"]
-    named = {canonicalize_name(one["name"]): one["version"] for one in [root, *sbom["components"]]}
+    named = {
+        canonicalize_name(one["name"]): one["version"].partition("+")[0]
+        for one in [root, *sbom["components"]]
+    }
     out = [f"{name} {version} is not in the bill" for name, version in installed.items()
            if named.get(name) != version]  # fmt: skip
     return out + [f"{name} is not installed" for name in named.keys() - installed.keys()]
