@@ -81,7 +81,15 @@ class Errands:
     def next(self) -> None:
         """Do one, and compare it with the first of its sort and seed."""
         sort = str(self._rng.choice(list(self._sorts), p=self._shares))
-        seed = int(self._rng.integers(SEEDS))
+        self._do(sort, int(self._rng.integers(SEEDS)))
+
+    def each(self) -> None:
+        """Do one of every sort and seed, so that all code is loaded and every cache begun."""
+        for sort in self._sorts:
+            for seed in range(SEEDS):
+                self._do(sort, seed)
+
+    def _do(self, sort: str, seed: int) -> None:
         self.counts[sort] += 1
         try:
             found = self._sorts[sort](seed)

@@ -182,6 +182,7 @@ def many(form: Form, tally: Tally, folder: Path) -> None:
     """Thousands of short runs of every sort in this process."""
     n_runs = form.pick(150, 10_000)
     errands = Errands(folder / "many", form.seed)
+    errands.each()
     samples = repeat(errands.next, n_runs, form.pick(15, 50))
     tally.survive(errands.right)
     for wrong in errands.wrong:
