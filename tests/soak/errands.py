@@ -20,6 +20,13 @@ from soak.sameness import digest
 TICKS = 20
 SHORT = f"duration={TICKS / 1000}"
 SEEDS = 3
+OFTEN = {
+    "simulated, pd": 5.0,
+    "simulated, dnn_mso": 5.0,
+    "episode": 5.0,
+    "read": 5.0,
+    "logged": 2.0,
+}
 REFUSED = (
     ("paper", ["dt=banana"]),
     ("paper", ["controller={kind: nobody}"]),
@@ -65,10 +72,24 @@ class Errands:
             "diverged": self._diverged,
         }
 
+    @property
+    def _shares(self) -> np.ndarray:
+        """How often each sort comes: what takes longer more seldom."""
+        weights = np.array([OFTEN.get(sort, 1.0) for sort in self._sorts])
+        return np.asarray(weights / weights.sum())
+
     def next(self) -> None:
         """Do one, and compare it with the first of its sort and seed."""
-        sort = str(self._rng.choice(list(self._sorts)))
-        seed = int(self._rng.integers(SEEDS))
+        sort = str(self._rng.choice(list(self._sorts), p=self._shares))
+        self._do(sort, int(self._rng.integers(SEEDS)))
+
+    def each(self) -> None:
+        """Do one of every sort and seed, so that all code is loaded and every cache begun."""
+        for sort in self._sorts:
+            for seed in range(SEEDS):
+                self._do(sort, seed)
+
+    def _do(self, sort: str, seed: int) -> None:
         self.counts[sort] += 1
         try:
             found = self._sorts[sort](seed)

@@ -46,9 +46,9 @@ def measured() -> Hashes:
         return {name: columns_digest(simulate(t.scenario())) for name, t in asked.items()}
 
 
-def known(file: Path = FILE) -> dict[str, Hashes]:
+def known() -> dict[str, Hashes]:
     """The hashes that are kept, by key."""
-    found: dict[str, Hashes] = json.loads(file.read_text()) if file.exists() else {}
+    found: dict[str, Hashes] = json.loads(FILE.read_text()) if FILE.exists() else {}
     return found
 
 

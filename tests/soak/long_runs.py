@@ -182,6 +182,7 @@ def many(form: Form, tally: Tally, folder: Path) -> None:
     """Thousands of short runs of every sort in this process."""
     n_runs = form.pick(150, 10_000)
     errands = Errands(folder / "many", form.seed)
+    errands.each()
     samples = repeat(errands.next, n_runs, form.pick(15, 50))
     tally.survive(errands.right)
     for wrong in errands.wrong:
@@ -190,7 +191,7 @@ def many(form: Form, tally: Tally, folder: Path) -> None:
     tally.figure("of each sort", dict(errands.counts))
     tally.figure("memory grown per 1000 runs (MiB)", round(1000 * slope(samples, "memory"), 3))
     tally.figure("objects grown per 1000 runs", round(1000 * slope(samples, "objects"), 1))
-    tally.figure("first and last sample", described(samples[len(samples) // 3], samples[-1]))
+    tally.figure("first and last sample", described(samples[len(samples) // 2], samples[-1]))
     judge(samples, tally, unit="run", memory=RUN_MIB, objects=RUN_OBJECTS)
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from soak.tally import Tally
 
 MIB = 1 << 20
-WARM_UP = 0.3  # share of the samples that is left out: arenas and caches fill
-NOISE_MIB = 2.0  # that an allocator may give or take, whatever is done
+WARM_UP = 0.5  # share of the samples that is left out: arenas and caches fill
+NOISE_MIB = 4.0  # that an allocator may give or take, whatever is done
 
 
 @dataclass(frozen=True)
