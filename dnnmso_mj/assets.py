@@ -68,8 +68,8 @@ def _file_name(path: str) -> str:
     name = Path(path).name
     if name in {"", ".", ".."} or not name.isprintable() or len(name.encode()) > LONGEST_NAME:
         raise ScenarioError(
-            f"plant.model: the MJCF of a log names the file {show(path)}; allowed: the name of a file, of at "
-            f"most {LONGEST_NAME} bytes"
+            f"plant.model: the MJCF of a log names the file {show(path)}; allowed: the name of a "
+            f"file, of at most {LONGEST_NAME} bytes"
         )
     return name
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from soak.sockets import watched
 from sweep_samples import (
     DEADLY_SEED,
     Deadly,
@@ -110,12 +111,16 @@ def test_every_row_is_there_although_a_node_is_killed_in_mid_sweep(cluster, tmp_
     assert untimed(result.table).equals(untimed(local(plan, tmp_path)))
 
 
-def test_the_command_starts_ray_by_itself_and_prints_nothing_else(tmp_path):
+def test_the_command_starts_ray_by_itself_for_this_machine_alone_and_prints_nothing_else(tmp_path):
     foreign_modules(tmp_path)  # which no worker shall import
     args = ("sweep", "paper", "--seeds", "0:4", "--set", "duration=0.1", "--out", "x.parquet")
-    done = dnnmso(*args, "--engine", "ray", "--jobs", "2", "--json", cwd=tmp_path)
+    args = (*args, "--engine", "ray", "--jobs", "2", "--json")
+    with watched() as seen:
+        done = dnnmso(*args, cwd=tmp_path, env=seen.environment)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
+    assert len(seen.sockets) >= 4
+    assert not seen.open_to_others
     document = json.loads(done.stdout)
     assert (document["engine"], document["jobs"], document["ok"]) == ("ray", 2, 4)
     assert pq.read_table(tmp_path / "x.parquet").num_rows == 4

@@ -30,7 +30,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def judged(log: Path, path: Path, kind: str, broken: str | None) -> Tally:
     tally = Tally()
-    readers = Readers(log, tally, broken)
+    readers = Readers(log, tally, broken, 1)
     try:
         readers.judge("one log", path, kind)
     finally:

@@ -17,7 +17,7 @@ PACKAGE = Path(dnnmso_mj.__file__).parent
 CONFIG = PACKAGE.parent / "pyproject.toml"
 
 # exec, pickle, marshal, eval, XML with entities, unsafe YAML, shells, torch.load, banned names
-RULES = "S102,S301,S302,S307,S314,S317,S318,S319,S320,S506,S602,S604,S605,S609,TID251"
+RULES = "S102,S301,S302,S307,S314,S317,S318,S319,S506,S602,S604,S605,S609,TID251"
 
 UNSAFE = {
     "eval": "eval(text)",

@@ -33,6 +33,10 @@ if TYPE_CHECKING:
     from dnnmso_mj.sweep.summary import Failure, PointSummary
 
 POINTS_SHOWN = 12
+LISTENS = (
+    "For the cluster this machine listens on all its addresses until the sweep is over: whoever "
+    "reaches them needs no password."
+)
 FAILURES_SHOWN = 10
 FAILURES_IN_JSON = 100
 
@@ -64,6 +68,8 @@ def sweep(
     from dnnmso_mj.sweep.summary import summarise
 
     runner = make_engine(engine, jobs, address)
+    if address is not None:
+        print(LISTENS, file=sys.stderr)
     with working("checking every point"):
         numbers = parse_seeds(seeds)
         plan = plan_sweep(scenario, numbers, overrides or (), grid or (), trust=trust)

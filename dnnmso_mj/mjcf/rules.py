@@ -155,7 +155,7 @@ def _count(root: Tag) -> None:
         tag, copies, depth = waiting.pop()
         elements += copies
         bodies += copies * (tag.tag == "body")
-        copies *= int(float(tag.get("count", "1"))) if tag.tag == "replicate" else 1
+        copies *= int(_number(tag, "count", 1.0)) if tag.tag == "replicate" else 1
         if depth > MAX_DEPTH:
             raise refuse(tag, f"is nested too deeply; allowed: {MAX_DEPTH} levels")
         if elements > MAX_COPIES or copies > MAX_COPIES:
@@ -165,15 +165,25 @@ def _count(root: Tag) -> None:
         waiting += [(part, copies, depth + 1) for part in below(tag)]
 
 
+def _number(tag: Tag, key: str, default: float = 0.0) -> float:
+    """The one number of an attribute."""
+    words = tag.get(key, "").split()
+    if not words:
+        return default
+    if len(words) > 1 or not _NUMBER.fullmatch(words[0]):
+        raise refuse(tag, "is not one number; allowed: a decimal number", key)
+    return float(words[0])
+
+
 def _check_grids(root: Tag) -> None:
     """The numbers that textures and height fields are made of, in sum."""
     pixels = heights = 0.0
     for tag in walk(root):
         if tag.tag == "texture":
-            width, height = (float(tag.get(key) or 0) for key in ("width", "height"))
+            width, height = (_number(tag, key) for key in ("width", "height"))
             pixels += max(width * height, 6 * width**2 if tag.get("type", "cube") != "2d" else 0)
         elif tag.tag == "hfield":
-            heights += float(tag.get("nrow") or 0) * float(tag.get("ncol") or 0)
+            heights += _number(tag, "nrow") * _number(tag, "ncol")
         if pixels > MAX_PIXELS:
             raise refuse(tag, f"makes too many pixels; allowed: {MAX_PIXELS} of all", "width")
         if heights > MAX_HEIGHTS:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -88,10 +89,12 @@ def ended(process: Process, folder: Path, seconds: float = 60.0) -> Told:
 
 
 def kill(process: Process) -> int:
-    """SIGKILL, and wait; the time (ns) at which it was sent."""
+    """SIGKILL to it and what it has forked, and wait; the time (ns) at which it was sent."""
+    assert process.pid, "it has not been started"
     at = time.monotonic_ns()
-    with suppress(ProcessLookupError):
-        process.kill()
+    with suppress(ProcessLookupError):  # it may not lead a group yet
+        os.killpg(process.pid, signal.SIGKILL)
+    process.kill()
     process.join()
     return at
 

@@ -15,7 +15,8 @@ from dnnmso_mj.scenario import Plant
 from dnnmso_mj.scene import Scene
 
 MAX_LEN = 2500
-SMALL = """<mujoco><worldbody><body name="link1"><joint name="j" axis="0 1 0"/><geom name="g"
+SMALL = """<mujoco><option><flag contact="disable"/></option><worldbody><body name="link1">
+<joint name="j" axis="0 1 0"/><geom name="g"
 type="capsule" fromto="0 0 0 1 0 0" size="0.05"/></body></worldbody><actuator><motor name="m"
 joint="j"/></actuator></mujoco>"""
 TAGS = (
@@ -45,6 +46,37 @@ VALUES = (
     "sphere", "box", "mesh", "hfield", "capsule", "plane", "ball", "free", "slide", "hinge", "../x",
     "/etc/passwd", "x.obj", "x.stl", "mujoco.elasticity.cable", "", "a" * 300, "1 " * 200,
 )  # fmt: skip
+KNOWN = {  # what an element usually has
+    "body": ("name", "pos", "quat", "axisangle", "euler", "childclass", "mocap", "gravcomp"),
+    "joint": (
+        "name",
+        "type",
+        "axis",
+        "pos",
+        "range",
+        "limited",
+        "armature",
+        "ref",
+        "class",
+        "damping",
+    ),
+    "geom": ("name", "type", "size", "pos", "fromto", "mass", "density", "rgba", "mesh", "class"),
+    "site": ("name", "pos", "size", "type", "quat"),
+    "inertial": ("pos", "mass", "diaginertia", "fullinertia", "quat"),
+    "motor": ("name", "joint", "gear", "ctrlrange", "group", "class"),
+    "option": ("timestep", "gravity", "integrator", "iterations", "solver"),
+    "compiler": ("angle", "coordinate", "balanceinertia", "boundmass", "eulerseq", "autolimits"),
+    "replicate": ("count", "offset", "euler", "sep"),
+    "frame": ("pos", "quat", "euler"),
+    "mesh": ("name", "vertex", "face", "scale", "file", "builtin", "inertia", "params"),
+    "hfield": ("name", "nrow", "ncol", "size", "elevation", "file"),
+    "texture": ("name", "type", "builtin", "width", "height", "file", "rgb1"),
+    "default": ("class",),
+    "numeric": ("name", "size", "data"),
+    "key": ("name", "time", "qpos", "qvel"),
+    "light": ("name", "pos", "dir"),
+    "camera": ("name", "pos", "mode", "target"),
+}
 _MARKS = ("/>", "&lt;", "<!DOCTYPE", "<!ENTITY a '", "&a;", "<![CDATA[", "<?xml encoding='", "<!--")
 WORDS = [*(f"<{tag}" for tag in TAGS), *(f' {name}="' for name in ATTRIBUTES), *VALUES, *_MARKS]
 
@@ -120,7 +152,11 @@ def mutate(data: bytes, rng: random.Random, raw: Callable[[bytes, int], bytes]) 
 
 
 def _set(here: ElementTree.Element, rng: random.Random) -> None:
-    here.set(rng.choice(ATTRIBUTES), rng.choice(VALUES))
+    here.set(_attribute(here.tag, rng), rng.choice(VALUES))
+
+
+def _attribute(tag: str, rng: random.Random) -> str:
+    return rng.choice(ATTRIBUTES if rng.random() < 0.1 else KNOWN.get(tag, ATTRIBUTES))
 
 
 def _change(here: ElementTree.Element, rng: random.Random) -> None:
@@ -132,7 +168,10 @@ def _drop(here: ElementTree.Element, rng: random.Random) -> None:
 
 
 def _add(here: ElementTree.Element, rng: random.Random) -> None:
-    here.append(ElementTree.Element(rng.choice(TAGS), {rng.choice(ATTRIBUTES): rng.choice(VALUES)}))
+    tag = rng.choice(TAGS if rng.random() < 0.2 else [*KNOWN])
+    part = ElementTree.SubElement(here, tag)
+    for _ in range(rng.randrange(4)):
+        _set(part, rng)
 
 
 def _cut(here: ElementTree.Element, rng: random.Random) -> None:
@@ -150,10 +189,24 @@ def _copy(here: ElementTree.Element, rng: random.Random) -> None:
 
 
 def _rename(here: ElementTree.Element, rng: random.Random) -> None:
-    here.tag = rng.choice(TAGS)
+    here.tag = rng.choice(TAGS if rng.random() < 0.2 else [*KNOWN])
 
 
-CHANGES = (_set, _set, _change, _change, _drop, _add, _cut, _copy, _copy, _rename)
+CHANGES = (
+    _set,
+    _set,
+    _set,
+    _change,
+    _change,
+    _change,
+    _drop,
+    _add,
+    _add,
+    _cut,
+    _copy,
+    _copy,
+    _rename,
+)
 
 
 def target(work: Path) -> Any:

@@ -36,6 +36,8 @@ GUIDED = [
     "dnnmso_mj.mjcf",
     "dnnmso_mj.recorded",
 ]  # not what numba compiles
+RAW = 0.2  # of all cases, by atheris' own mutations alone
+ANEW = 0.4  # of the others, from a real file: what reaches new code is mostly refused early
 KEEP = 1000  # cases, after which what was found is written
 
 
@@ -76,7 +78,7 @@ def main() -> None:
         if over:
             os._exit(0)
 
-    _mutate(part, case, folder, seed)
+    _mutate(part, case, folder, seed, seeds)
 
 
 def _generate(part: Any, guard: Any, seed: int, count: int) -> None:
@@ -101,7 +103,7 @@ def _generate(part: Any, guard: Any, seed: int, count: int) -> None:
     try_it()
 
 
-def _mutate(part: Any, case: Any, folder: Path, seed: int) -> None:
+def _mutate(part: Any, case: Any, folder: Path, seed: int, seeds: list[bytes]) -> None:
     """Cases that atheris mutates, those first that reach new code; never returns."""
     words = "\n".join(f'"{_escaped(word)}"' for word in dict.fromkeys(part.WORDS) if word)
     (folder / "words.txt").write_text(words + "\n")
@@ -110,9 +112,10 @@ def _mutate(part: Any, case: Any, folder: Path, seed: int) -> None:
         f"-seed={seed % 2**31 + 1}",  # 0 would mean any
         f"-max_len={part.MAX_LEN}",
         "-rss_limit_mb=4096",
-        "-timeout=100",
+        "-timeout=1000000",  # `fuzzing` sees to that, and its alarm may kill
         "-reload=0",
         "-len_control=0",
+        "-mutate_depth=2",
         f"-artifact_prefix={folder}/",
         str(folder / "corpus"),
     ]
@@ -122,9 +125,14 @@ def _mutate(part: Any, case: Any, folder: Path, seed: int) -> None:
 
         def mutate(data: bytes, longest: int, number: int) -> bytes:
             rng = random.Random(number)
-            if rng.random() < 0.3:
+            if rng.random() < RAW:
                 return bytes(atheris.Mutate(data, longest))
-            return bytes(own(data, rng, atheris.Mutate))[:longest]
+            if rng.random() < ANEW:
+                data = rng.choice(seeds)
+            try:
+                return bytes(own(data, rng, atheris.Mutate))[:longest]
+            except Exception:  # what was broken before may be beyond surgery
+                return bytes(atheris.Mutate(data, longest))
 
         more = {"custom_mutator": mutate}
     atheris.Setup([sys.argv[0], *options], case, **more)

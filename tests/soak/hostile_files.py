@@ -11,6 +11,7 @@ import os
 import random
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -248,7 +249,7 @@ def _logs(rng: random.Random, count: int, place: Place, attempt: Attempt) -> Non
         text = files["arm.xml"].decode("utf-8", "replace")
         kept = {"asset/../outside/secret.stl": b"new", "asset/..": b"new", "asset/a/..": b"new"}
         attempt(f"log: {what}", lambda text=text, kept=kept: _put_back(text, kept), "plant.model")
-    for name in ("..", "a/..", "../outside/secret.stl", str(place.outside / "new.stl")):
+    for name in ("..", "a/..", "x" * 300 + ".stl", "a&#10;b.stl"):
         text = hostile_mjcf.world(before=f'<asset><mesh file="{name}"/></asset>')
         kept = {f"asset/{name}": hostile_mjcf.STL}
         attempt(
@@ -288,6 +289,14 @@ def _let_in(place: Place, tally: Tally) -> None:
         outcome = watch(lambda s=sets, t=trust: prepare(file, s, place.here, t), place.canaries)
         if outcome.error or not any("secret.xml" in name for name in outcome.touched):
             tally.lose(f"{what}: {outcome.error} {outcome.text}, touched {outcome.touched}")
+        else:
+            tally.survive()
+    for name in ("../outside/secret.stl", str(place.outside / "new.stl")):
+        text = hostile_mjcf.world(before=f'<asset><mesh name="m" file="{name}"/></asset>')
+        kept = {f"asset/{name}": hostile_mjcf.STL}
+        outcome = watch(partial(_put_back, text, kept), place.canaries)
+        if outcome.error or outcome.touched:  # the log's own copy serves, in a folder of its own
+            tally.lose(f"log's copy of {name}: {outcome}")
         else:
             tally.survive()
 

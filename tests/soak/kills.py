@@ -96,13 +96,14 @@ def many(tally: Tally, folder: Path, seed: int, what: str, trial: Trial, count: 
             if cost is not None:
                 losses.append(cost)
                 assert cost.simulated_s <= BOUND_S + 1e-9, f"{cost.simulated_s:.3f} s are lost"
-        shutil.rmtree(place)
+        shutil.rmtree(place, ignore_errors=True)
 
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(one, range(count)))
     if losses:
         simulated = round(max(cost.simulated_s for cost in losses), 4)
         wall = round(max(cost.wall_s for cost in losses), 4)
+        tally.figure(f"{what}: killed under way", len(losses))
         tally.figure(f"{what}: most lost (s, simulated)", simulated)
         tally.figure(f"{what}: most lost (s, wall)", wall)
 
@@ -208,7 +209,6 @@ def kill_figures(known: Known, place: Path, rng: np.random.Generator) -> None:
     process = start(save_figures, known.paced, place, "run")
     time.sleep(rng.uniform(0.0, 1.5))
     kill(process)
-    time.sleep(0.05)  # what it has forked ends by itself
     for picture in place.glob("[!.]*.png"):
         with Image.open(picture) as image:
             image.load()

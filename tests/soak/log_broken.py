@@ -10,7 +10,7 @@ from typing import Any
 
 import lz4.frame
 
-from dnnmso_mj.log import limits, prefix, records
+from dnnmso_mj.log import limits, prefix, records, rows
 
 
 def leave_out() -> None:
@@ -25,6 +25,7 @@ def leave_out() -> None:
 
     records.chunk = chunk
     prefix._Order.following = lambda _self, messages: len(messages)
+    rows.Rows._check_times = lambda _self, _times, _numbers: None
 
 
 def unbound() -> None:

@@ -1,6 +1,6 @@
 """Reads logs as every command does, each in a forked child that tells what it found and cost.
 
-As a program: log_worker.py ORIGINAL, then a line of JSON with a path on standard input for each log.
+As a program: log_worker.py ORIGINAL, then on standard input a line of JSON for each log.
 """
 
 from __future__ import annotations

@@ -69,18 +69,21 @@ class Worker:
 
 
 class Readers:
-    """Two workers, and what the good log costs them.
+    """Workers, and what the good log costs them.
 
     Args:
         original: the good log.
         tally: of what became of the others.
         broken: see `Worker`.
+        count: of workers.
     """
 
-    def __init__(self, original: Path, tally: Tally, broken: str | None = None) -> None:
+    def __init__(
+        self, original: Path, tally: Tally, broken: str | None = None, count: int = 2
+    ) -> None:
         self._tally = tally
         self._free: SimpleQueue[Worker] = SimpleQueue()
-        self._all = [Worker(original, broken) for _ in range(2)]
+        self._all = [Worker(original, broken) for _ in range(count)]
         for worker in self._all:
             self._free.put(worker)
         good = [worker.read(original, "whole") for worker in self._all]
@@ -272,7 +275,8 @@ def commands(form: Form, tally: Tally, original: Path, folder: Path) -> None:
             ("plot", none), ("plot", torn), ("resume", none, "--at", "0.1"),
             ("resume", torn, "--at", "0.1"), ("replay", none, "--save", folder / "a.rrd"),
             ("replay", torn, "--save", folder / "b.rrd"),
-            ("report", none, "--out", folder / "b.html"), ("report", torn, "--out", folder / "c.html"),
+            ("report", none, "--out", folder / "b.html"),
+            ("report", torn, "--out", folder / "c.html"),
             ("info", fifo), ("recover", fifo),
         ]  # fmt: skip
     for line in words:
