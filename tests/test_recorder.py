@@ -13,6 +13,7 @@ import pytest
 from log_samples import LAYOUT, MJCF, OK, recorder, rows, scenario, scene
 from mcap.reader import make_reader
 from mcap.records import Attachment
+from test_log_writer import Watched
 from test_recording import full_disk, repeat
 
 from dnnmso_mj import recording
@@ -390,3 +391,12 @@ def test_what_was_written_can_be_read_even_where_its_name_was_taken_away(tmp_pat
             log.finish(OK)
         assert log.broken is True
         assert log.readable == log.path
+
+
+def test_a_snapshot_is_with_the_operating_system_at_once():
+    file = Watched()
+    content = LogContent(LogWriter(file), LAYOUT, scenario(), scene())
+    content.start(MJCF)
+    content.attach_snapshot("net", 0.0, {"W": np.ones(3)})
+    assert file.flushed == len(file.getvalue())
+    assert b"snapshot/net/0.0.npz" in file.getvalue()
