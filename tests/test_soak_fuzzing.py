@@ -15,11 +15,13 @@ from soak.tally import Tally
 
 @pytest.mark.alone
 def test_fuzzed_input_gives_typed_errors_only(tmp_path):
+    pytest.importorskip("atheris")
     prove(7, tmp_path)
 
 
 def test_a_broken_target_is_lost_in_each_way_that_it_is_broken(tmp_path):
     """A KeyError, a second too long, 300 MB too much, and the end of the process."""
+    pytest.importorskip("atheris")
     found = fuzz(Job("planted", 50, 1000), tmp_path)
     inputs = [base64.b64decode(failure.input) for failure in found.failures.values()]
     for word in (b"key", b"slow", b"big", b"die"):

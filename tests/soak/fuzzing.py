@@ -16,6 +16,7 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 from soak.fuzz_guard import Failure, Found, tried_now
@@ -65,6 +66,9 @@ LONG = (
 
 
 def run(form: Form, tally: Tally, folder: Path) -> None:
+    if find_spec("atheris") is None:
+        tally.leave_out("all of it", "atheris is not installed")
+        return
     jobs = [
         replace(job, seed=1000 * form.seed + 100 * k)
         for k, job in enumerate(form.pick(SHORT, LONG))
