@@ -176,8 +176,11 @@ class McapRecorder:
         """For how long the loop had to wait for the disk so far."""
         return self._background.waited_s
 
-    def flush(self) -> None:
+    def flush(self) -> int:
         """Wait until everything so far is with the operating system, so that it can be read.
+
+        Returns:
+            How many ticks that is; a Ctrl-C in `append` may have kept the last block out.
 
         Raises:
             LogError: the file cannot be written.
@@ -185,6 +188,7 @@ class McapRecorder:
         with self._writing():
             self._background.put(self._content.flush)
             self._background.drain()
+        return self._content.ticks
 
     def finish(self, info: RunInfo) -> None:
         """Write what is left, the status and the metrics, and close the file.

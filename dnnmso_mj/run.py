@@ -140,8 +140,8 @@ def _finish(
     """Compute the metrics of what the log holds, and end log and view with them."""
     done: LoggedRun | None = None
     try:
-        recorder.flush()
-        done = judge(recorder.path, scenario, layout, info, recorder.ticks, recorder.readable)
+        ticks = recorder.flush()
+        done = judge(recorder.path, scenario, layout, info, ticks, recorder.readable)
         recorder.finish(done.info)
     except LogError as error:
         if not recorder.broken:

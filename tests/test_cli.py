@@ -396,7 +396,7 @@ def test_check_names_the_model_that_it_was_given(tmp_path):
     assert done.stderr.startswith("error: --model arm3.xml: 3 bodies and 2 joints; allowed: 2")
     (tmp_path / "torn.xml").write_text(model[:500])
     done = dnnmso("check", "--model", "torn.xml", "--states", 1, cwd=tmp_path)
-    assert done.stderr.startswith("error: --model torn.xml: MuJoCo says")
+    assert done.stderr.startswith("error: --model torn.xml: torn.xml:1: not XML")
 
 
 def test_logs_that_cannot_be_compared_leave_no_figures(tmp_path, short_log):

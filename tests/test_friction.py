@@ -14,6 +14,7 @@ from dnnmso_mj.metrics import compute_metrics
 from dnnmso_mj.plant import Mjcf, Plant, integrate
 from dnnmso_mj.scenario import Friction
 from dnnmso_mj.simulation import Simulation, simulate
+from dnnmso_mj.tick import MUJOCO_ZEROES_ABOVE
 
 DT = 1e-3
 INTEGRATORS = ["rk4", "euler", "implicitfast"]
@@ -34,7 +35,7 @@ class Coasting:
         q, qd = np.zeros((2, n_ticks, 2))
         for k in range(n_ticks):
             q[k], qd[k] = self.plant.q, self.plant.qd
-            load(self.loads, self.plant.view, np.array(tau), DT)
+            load(self.loads, self.plant.view, np.array(tau), DT, MUJOCO_ZEROES_ABOVE)
             integrate(self.plant.view)
         return q, qd
 
@@ -106,7 +107,7 @@ def test_friction_is_full_against_motion_or_less_at_rest(make_scenario, n):
     for _ in range(50):
         plant.reset(rng.uniform(-1, 1, n), rng.normal(0.0, 0.02, n))
         start_loads(loads)
-        load(loads, plant.view, rng.normal(0.0, 10.0, n), DT)
+        load(loads, plant.view, rng.normal(0.0, 10.0, n), DT, MUJOCO_ZEROES_ABOVE)
         v = plant.qd + DT * plant.view.qacc
         free = np.abs(loads.torque) >= most
         assert np.abs(loads.torque).max() <= most

@@ -81,13 +81,13 @@ def test_a_ctrl_c_while_a_whole_run_ends_changes_nothing(tmp_path, monkeypatch):
     """Pressed for real, at the moment when the log of a run that is done is being finished."""
     from dnnmso_mj import run
 
-    compute = run.compute_metrics
+    judge = run.judge
 
-    def press(trace):
+    def press(*arguments):
         os.kill(os.getpid(), signal.SIGINT)
-        return compute(trace)
+        return judge(*arguments)
 
-    monkeypatch.setattr(run, "compute_metrics", press)
+    monkeypatch.setattr(run, "judge", press)
     scenario = load_scenario("paper_no_network", ["duration=0.1"])
     done = run_logged(scenario, tmp_path / "run.mcap")
     assert done.trace.info.status == "ok"

@@ -158,6 +158,8 @@ def test_a_controller_that_overruns_is_found_out_in_an_interpreted_loop_too(
 class SlowAtFirst(MemoryRecorder):
     """A recorder that takes 50 ms for the state before the first tick."""
 
+    keeps_snapshots = True
+
     def snapshot(self, name, t, arrays):
         time.sleep(0.05 if t == 0.0 else 0.0)
         super().snapshot(name, t, arrays)

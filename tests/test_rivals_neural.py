@@ -57,7 +57,9 @@ def run_edited(scenario, mjcf, edit):
 
 
 def rmse(trace) -> float:
-    return compute_metrics(trace)["rmse_steady"]
+    """Of a run that diverged: infinite."""
+    metrics = compute_metrics(trace)
+    return np.inf if metrics["diverged"] else metrics["rmse_steady"]
 
 
 def fed(n_ticks: int, n: int = 2):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pydantic import ValidationError
@@ -39,6 +39,7 @@ class Complaint:
     path: KeyPath
     text: str
     missing: bool = False
+    untold: int = 0  # problems beside it that were not put in words
 
 
 def complain(path: KeyPath, data: Any, problem: str, root: Shape | None = None) -> Complaint:
@@ -61,8 +62,6 @@ def explain(error: ValidationError, data: Any, root: Shape | None = None) -> lis
     root = root or Shape.root()
     out: list[Complaint] = []
     details = error.errors(include_url=False, include_input=False)
-    if len(details) > MAX_EXPLAINED:
-        out.append(Complaint((), f"{len(details)} problems; allowed: none; here are some"))
     for detail in details[:MAX_EXPLAINED]:
         path = _key_path(detail["loc"], data, root)
         problems = detail.get("ctx", {}).get("problems")
@@ -72,6 +71,8 @@ def explain(error: ValidationError, data: Any, root: Shape | None = None) -> lis
         for below, problem in problems:
             whole = (*path, *(int(p) if p.isdecimal() else p for p in below.split(".")))
             out.append(complain(whole, data, problem, root))
+    if len(details) > MAX_EXPLAINED:
+        out[-1] = replace(out[-1], untold=len(details) - MAX_EXPLAINED)
     return out
 
 

@@ -60,7 +60,8 @@ class Places:
         lines.sort(key=lambda line: line[0])
         texts = [f"{place}: {text}" for _, place, text in lines]
         if len(texts) > MAX_LINES:
-            texts[MAX_LINES:] = [f"… and {len(texts) - MAX_LINES} more"]
+            untold = sum(complaint.untold for complaint in complaints)
+            texts[MAX_LINES:] = [f"… and {len(texts) - MAX_LINES + untold} more"]
         return "\n".join(texts)
 
     def home(self, path: KeyPath) -> Path | None:

@@ -38,10 +38,10 @@ class Background:
     def put(self, job: Job, size: int = 0) -> None:
         """Have a job done that holds `size` bytes until then, after those put off."""
         self.put_off(job, size)
-        for given in self._put_off:
+        while self._put_off:
+            given = self._put_off.pop(0)  # first: a Ctrl-C in between must not have it done twice
             self._jobs.put(given)
             self._given += given[1]
-        self._put_off.clear()
         if self._given - self._done > self._limit:
             self._wait_for_room()
 

@@ -97,6 +97,11 @@ class LogContent:
         writer.add_message(self._channels[SCENE.name], 0, scene_update(self._scene))
         writer.flush()
 
+    @property
+    def ticks(self) -> int:
+        """How many it was given."""
+        return self._written + self._filled
+
     def take(self, rows: Array) -> None:
         """Add rows to the block in progress, and write it once it holds enough."""
         while len(rows):

@@ -50,6 +50,13 @@ NonNegativeEach = Annotated[
     BeforeValidator(_vector),
     _number_or_list({"type": "number", "minimum": 0}),
 ]
+# MuJoCo's own integrators take damping in; with more than this their stages overflow.
+DampingEach = Annotated[
+    tuple[Annotated[NonNegative, Field(le=1e9)], ...],
+    Field(min_length=1),
+    BeforeValidator(_vector),
+    _number_or_list({"type": "number", "minimum": 0, "maximum": 1e9}),
+]
 FiniteEach = Annotated[
     tuple[Finite, ...],
     Field(min_length=1),

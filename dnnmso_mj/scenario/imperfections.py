@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from dnnmso_mj.scenario.external import ExternalImperfection
 from dnnmso_mj.scenario.fields import (
     CountEach,
+    DampingEach,
     FiniteEach,
     NonNegativeEach,
     PositiveEach,
@@ -24,7 +25,7 @@ Delay = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 class Friction(Strict):
     """-(viscous q̇ + [coulomb + (breakaway - coulomb) exp(-(q̇/stribeck_velocity)²)] sign q̇)."""
 
-    viscous: NonNegativeEach = (0.0,)
+    viscous: DampingEach = (0.0,)
     """Friction that grows with velocity (N·m·s/rad)."""
     coulomb: NonNegativeEach = (0.0,)
     """Dry friction of a joint that moves (N·m)."""

@@ -111,6 +111,11 @@ def check_reason(struck: Struck, fault: Fault, trace: Trace) -> None:
     # A weight shows in the tick after; an infinite moment stops learning, and is found in a second.
     delays = {"weights": 1, "gradient": 1, "torque": 4}
     late = delays.get(fault.where, 0)
+    if trace.scenario.controller.kind == "dnn_mso_replay" and fault.where in {
+        "weights",
+        "gradient",
+    }:
+        late += 1  # it drives by a mean of the weights that were before
     if fault.where in {"optimiser", "observer"} or may_live(fault):
         late = trace.scenario.n_ticks - fault.tick
     if not math.isfinite(fault.value):
