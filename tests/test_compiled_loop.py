@@ -182,27 +182,6 @@ def test_without_compilation_one_line_says_so():
     assert done.stderr.startswith("error: NUMBA_DISABLE_JIT is set")
 
 
-def test_the_run_that_compiles_is_the_run_that_loads_bit_for_bit(tmp_path):
-    program = (
-        "import hashlib; from dnnmso_mj.loading import load_scenario\n"
-        "from dnnmso_mj.simulation import simulate\n"
-        "trace = simulate(load_scenario('paper', ['duration=0.3']))\n"
-        "print(hashlib.sha256(trace['tau'].tobytes()).hexdigest())\n"
-    )
-    runs = [
-        subprocess.run(
-            [sys.executable, "-c", program],
-            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        for _ in range(2)
-    ]
-    assert [bool(run.stderr) for run in runs] == [True, False]  # the first says that it compiles
-    assert runs[0].stdout == runs[1].stdout
-
-
 def test_a_scenario_cut_short_of_its_events_can_be_compiled_elsewhere():
     whole = load_scenario("hard")
     tick = whole.model_copy(update={"duration": whole.dt})

@@ -19,6 +19,7 @@ from dnnmso_mj.cli.shared import progress_bar, working
 from dnnmso_mj.errors import RunInterrupted
 from dnnmso_mj.interrupts import heard, interrupted_once, raise_lost, remember_presses
 from dnnmso_mj.loading import load_scenario
+from dnnmso_mj.log.background import Background
 from dnnmso_mj.reading import log_info, read_trace
 from dnnmso_mj.run import run_logged
 
@@ -101,6 +102,28 @@ def test_a_ctrl_c_while_a_whole_run_ends_changes_nothing(tmp_path, monkeypatch):
         run_logged(scenario, tmp_path / "stopped.mcap", progress=stop)
     assert interrupted.value.ticks == len(interrupted.value.run.trace) > 0
     assert log_info(tmp_path / "stopped.mcap").complete
+
+
+@pytest.mark.parametrize("taken", [False, True], ids=["before it is taken", "after"])
+def test_a_ctrl_c_while_a_block_is_handed_over_leaves_a_whole_log(tmp_path, monkeypatch, taken):
+    """Wherever in the recorder it comes: the last block is in the log, or it is not."""
+    put, blocks = Background.put, 0
+
+    def press(background, job, size=0):
+        nonlocal blocks
+        blocks += size > 0
+        if not size or blocks != 3 or taken:
+            put(background, job, size)
+        if size and blocks == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Background, "put", press)
+    with pytest.raises(RunInterrupted) as stop:
+        run_logged(load_scenario("paper_no_network", ["duration=0.5"]), tmp_path / "run.mcap")
+    trace = read_trace(tmp_path / "run.mcap")
+    assert log_info(tmp_path / "run.mcap").complete
+    assert (trace.info.status, len(trace)) == ("interrupted", stop.value.ticks)
+    assert trace["t"].tolist() == [k * 0.001 for k in range(len(trace))]
 
 
 def test_the_first_raises_and_the_others_do_not():

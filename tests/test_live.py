@@ -214,6 +214,7 @@ def test_a_streamer_that_dies_is_told_by_its_last_words(plain, tmp_path):
     with rerun("--port", str(port), "--serve-grpc"), connected(data_address(port)) as view:
 
         def kill() -> None:
+            wait_until(lambda: processes(b"streamer"))
             [streamer] = processes(b"streamer")
             os.kill(streamer, signal.SIGKILL)
 
@@ -348,7 +349,7 @@ def streams_to(address: str) -> bool:
     return False
 
 
-def wait_until(happened: Callable[[], bool]) -> None:
+def wait_until(happened: Callable[[], object]) -> None:
     deadline = time.monotonic() + 30.0
     while not happened():
         assert time.monotonic() < deadline
@@ -379,6 +380,7 @@ def test_the_controller_is_as_fast_with_a_viewer_as_without(tmp_path, capsys):
         viewer.wait_until(lambda: listens(port), "ready")
         [viewer_group] = children()
         with connected(data_address(port)) as view:
+            wait_until(lambda: processes(b"viewer.streamer"))
             [streamer] = processes(b"viewer.streamer")
             run = run_logged(
                 scenario, tmp_path / "run.mcap", real_time=True, live=view, progress=progress

@@ -28,10 +28,10 @@ def test_long_runs_and_many_runs_stay_flat(tmp_path: Path) -> None:
     prove(11, tmp_path)
 
 
-def found(errand: Callable[[], None], count: int = 60) -> Tally:
+def found(errand: Callable[[], None], count: int = 30) -> Tally:
     """What the row says of something done again and again."""
     tally = Tally()
-    judge(repeat(errand, count, 20), tally, unit="run", memory=1e-3, objects=0.5)
+    judge(repeat(errand, count, 10), tally, unit="run", memory=1e-3, objects=0.5)
     return tally
 
 
@@ -55,7 +55,7 @@ def test_what_leaks_nothing_is_flat() -> None:
 @pytest.mark.parametrize(
     ("leak", "said"),
     [
-        (lambda kept, _: kept.append(np.ones(50_000)), "memory grows"),
+        (lambda kept, _: kept.append(np.ones(100_000)), "memory grows"),
         (lambda kept, _: kept.extend([] for _ in range(40)), "objects grows"),
         (lambda kept, folder: kept.append(os.open(folder, os.O_RDONLY)), "descriptors"),
         (lambda _, folder: tempfile.NamedTemporaryFile(dir=folder, delete=False).close(), "files"),
@@ -78,7 +78,7 @@ def test_a_thread_that_stays_is_lost(kept: list[object]) -> None:
         threading.Thread(target=end.wait, daemon=True).start()
         kept.append(end)
 
-    tally = found(start, 40)
+    tally = found(start, 20)
     assert {"threads", "enumerated"} <= {lost.partition(":")[0] for lost in tally.lost}
 
 
