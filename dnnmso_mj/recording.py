@@ -207,9 +207,8 @@ class McapRecorder:
             self._background.put(partial(self._content.finish, records))
             self._background.drain()
             if not self._place.is_there:
-                raise FileNotFoundError(None, "it was moved or removed while the run was writing")
-            self._background.put(self._file.close)
-            self._background.drain()
+                raise FileNotFoundError("it was moved or removed while the run was writing")
+            self._file.close()
             self._closed = True
             self._background.stop()
 

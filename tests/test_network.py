@@ -304,6 +304,11 @@ def test_reference_keeps_each_parameters_moments_apart_and_skips_those_without_g
     for W, gradients in ((one, [1.0, -2.0, 0.5]), (other, [1e-3, 3e-3, -1e-3])):
         moment = sum(0.1 * 0.9 ** (2 - k) * g**2 for k, g in enumerate(gradients))
         assert optimizer.state[W]["g_bar_sq"].tolist() == pytest.approx([moment] * 2, rel=1e-12)
+        weight = 1.0
+        for k in range(1, 4):
+            moment = sum(0.1 * 0.9 ** (k - 1 - j) * gradients[j] ** 2 for j in range(k))
+            weight *= math.exp(-0.01 * gradients[k - 1] / math.sqrt(moment / (1 - 0.9**k)))
+        assert W.tolist() == pytest.approx([weight] * 2, rel=1e-12)
     assert still.tolist() == [1.0, 1.0]
     assert still not in optimizer.state
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -97,6 +99,62 @@ def test_after_a_flush_everything_so_far_can_be_read(tmp_path):
             assert info.events[-1].message == f"{count} ticks"
             assert read_snapshots(tmp_path / "run.mcap")[-1].arrays["W"].size == count
         open_log.finish(OK)
+
+
+def test_a_flush_waits_for_a_slow_disk(tmp_path, monkeypatch):
+    flush = LogContent.flush
+
+    def slowly(content: LogContent) -> None:
+        time.sleep(0.1)
+        flush(content)
+
+    with recorder(tmp_path / "run.mcap") as open_log:
+        monkeypatch.setattr(LogContent, "flush", slowly)
+        open_log.append(rows(3))
+        assert open_log.flush() == 3
+        assert log_info(tmp_path / "run.mcap").ticks == 3
+        open_log.finish(OK)
+
+
+def logging_threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "dnnmso-log"]
+
+
+def test_a_finished_log_is_closed_and_nobody_waits_to_write_it(tmp_path):
+    before = len(logging_threads())
+    with recorder(tmp_path / "run.mcap") as open_log:
+        open_log.append(rows(3))
+        open_log.finish(OK)
+    links = [os.path.realpath(f"/proc/self/fd/{name}") for name in os.listdir("/proc/self/fd")]
+    assert str(tmp_path / "run.mcap") not in links
+    assert len(logging_threads()) == before
+
+
+def test_a_log_whose_name_was_taken_away_says_so_at_its_end(tmp_path):
+    before = len(logging_threads())
+    with recorder(tmp_path / "run.mcap") as open_log:
+        open_log.append(rows(3))
+        (tmp_path / "run.mcap").rename(tmp_path / "moved.mcap")
+        with pytest.raises(LogError) as refused:
+            open_log.finish(OK)
+    what = "it was moved or removed while the run was writing"
+    assert str(refused.value) == (
+        f"{tmp_path / 'run.mcap'} cannot be written: {what}. Choose another place for it."
+    )
+    assert log_info(tmp_path / "moved.mcap").ticks == 3
+    assert len(logging_threads()) == before
+
+
+def test_links_are_drawn_wherever_both_arm_and_reference_are_somewhere(tmp_path):
+    data = rows(40)
+    data[10, LAYOUT.slices["q_ref"]] = np.nan
+    data[20, LAYOUT.slices["q"]] = [np.nan, 0.0]
+    with recorder(tmp_path / "run.mcap") as open_log:
+        open_log.append(data)
+        open_log.finish(OK)
+    with (tmp_path / "run.mcap").open("rb") as file:
+        times = [m.log_time for _, _, m in make_reader(file).iter_messages(topics=["/tf"])]
+    assert times == [0, 30_000_000]
 
 
 def leave(log: Path, error: BaseException) -> None:
