@@ -34,7 +34,7 @@ def why_it_ended(world: World, layout: StepLayout) -> NonFiniteError:
         world: whose status is neither RUNNING nor SAFELY_STOPPED.
         layout: of its rows.
     """
-    far = _far_state(world)
+    far = far_state(world)
     if far is not None:
         return far
     status, above = world.counts[STATUS], f"above {MUJOCO_ZEROES_ABOVE:g}"
@@ -56,7 +56,7 @@ def _told(world: World) -> dict[str, Array]:
     return {"q": world.plant.q, "qd": world.plant.qd, "q_meas": q_meas, "qd_meas": qd_meas}
 
 
-def _far_state(world: World) -> NonFiniteError | None:
+def far_state(world: World) -> NonFiniteError | None:
     """A true state, or else a reading, where no arm is: all else that is wrong comes of it."""
     for name, values in _told(world).items():
         largest = float(np.abs(values).max())

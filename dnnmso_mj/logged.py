@@ -47,7 +47,7 @@ class LoggedRun:
         Raises:
             LogError: the log cannot be read any more, or is another run's by now.
         """
-        return self.kept or self._same(read_trace(self.log))
+        return self._same(read_trace(self.log)) if self.kept is None else self.kept
 
     def part(self, *columns: str) -> Trace:
         """Some columns alone.
@@ -72,7 +72,7 @@ class LoggedRun:
         Raises:
             LogError: as `trace`.
         """
-        return self.kept or self._same(_outline(self.log, self.ticks))
+        return self._same(_outline(self.log, self.ticks)) if self.kept is None else self.kept
 
     def _same(self, found: Trace) -> Trace:
         if (found.scenario, found.info) != (self.scenario, self.info):

@@ -15,7 +15,7 @@ from numba.core import event
 from dnnmso_mj.compile_loop import compile_elsewhere, compile_halves_elsewhere
 from dnnmso_mj.compiling import CompileNotice
 from dnnmso_mj.controllers import Controller, build_controller, compiled_ticks, no_command
-from dnnmso_mj.divergence import not_finite
+from dnnmso_mj.divergence import far_state, not_finite
 from dnnmso_mj.errors import EndedEarlyError, NonFiniteError
 from dnnmso_mj.memory_recorder import LARGEST_BLOCK, MemoryRecorder
 from dnnmso_mj.plant import Mjcf, Plant
@@ -205,6 +205,8 @@ class Simulation:
                 self._ticks.run(stage.world, self._ticks.parts, first, count)
             else:
                 self._run_interpreted(first, count)
+        except NonFiniteError as error:  # what a controller noticed may come of where the arm is
+            raise (far_state(stage.world) or error) from error
         finally:
             stage.close_block(recorder)
         if stage.world.counts[STATUS] != RUNNING:

@@ -17,7 +17,7 @@ from dnnmso_mj.plots import run_figures
 from dnnmso_mj.reading import log_info, read_trace
 from dnnmso_mj.run import run_logged
 from dnnmso_mj.sweep.task import Task, run_task
-from dnnmso_mj.trace import StepLayout
+from dnnmso_mj.trace import RunInfo, StepLayout
 
 PD = ["controller={kind: pd}", "duration=0.5"]
 
@@ -116,3 +116,12 @@ def test_a_log_that_lacks_what_it_was_given_is_no_run(
         assert (same.ticks, same.info.status) == (500, "ok")
         with pytest.raises(LogError, match="holds 500 ticks of 501 that it was given"):
             judge(done.log, done.scenario, layout, done.info, 501)
+
+
+def test_a_run_that_ended_before_its_first_tick_has_an_empty_trace(tmp_path: Path) -> None:
+    scenario = load_scenario("paper", PD)
+    info = RunInfo("diverged", scenario.seed, reason="q = [nan, 0.0] at t = 0 s")
+    layout = StepLayout(scenario.n_joints, 0)
+    done = judge(tmp_path / "run.mcap", scenario, layout, info, 0)
+    assert len(done.trace) == len(done.drawn()) == done.ticks == 0
+    assert done.trace.info.reason == info.reason
