@@ -37,7 +37,8 @@ run: $(VENV)/.installed-run
 	$(BIN)/dnnmso run $(SCENARIO)
 
 test: $(VENV)/.installed-test
-	$(BIN)/python -m pytest --numprocesses logical --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses logical --dist loadfile --no-loadscope-reorder \
+	  $(PYTEST_ARGS)
 
 soak: $(VENV)/.installed-test
 	PYTHONPATH=tests $(BIN)/python -m soak $(SOAK_ARGS)

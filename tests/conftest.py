@@ -47,6 +47,11 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The rows of the scorecard first: each takes long, and no worker shall end alone with one."""
+    items.sort(key=lambda item: not item.path.name.startswith("test_soak"))
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """Tests run beside those of other workers, but for those marked `alone`."""
