@@ -397,7 +397,7 @@ def test_a_bomb_of_aliases_is_counted_and_not_unfolded() -> None:
     layers = ["a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
     for above, name in zip("abcdefgh", "bcdefghi", strict=True):
         layers.append(f"{name}: &{name} [{', '.join([f'*{above}'] * 10)}]")
-    assert refusal("\n".join(layers)) == "s.yaml:4: too many values; allowed: at most 12000"
+    assert refusal("\n".join(layers)) == "s.yaml:4: too many values; allowed: at most 10000"
 
 
 def test_a_file_too_large_is_refused_unread() -> None:

@@ -31,7 +31,11 @@ from dnnmso_mj.scenario import Scenario
 from dnnmso_mj.simulation import simulate
 from dnnmso_mj.trace import StepLayout, Trace
 
-pytestmark = pytest.mark.filterwarnings("error")
+pytestmark = [
+    pytest.mark.filterwarnings("error"),
+    # What other tests have left behind, which may be collected here.
+    pytest.mark.filterwarnings("default::pytest.PytestUnraisableExceptionWarning"),
+]
 
 
 def trace_of(

@@ -5,13 +5,14 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urldefrag, urljoin
 
 import pytest
 import typer
-from playwright.sync_api import Page
+from playwright.sync_api import Page, TimeoutError
 
 import dnnmso_mj
 from dnnmso_mj.cli import app
@@ -166,8 +167,14 @@ def test_the_tabs_lead_to_every_section(page, address):
 @needs_chromium
 def test_search_finds_a_key_of_the_scenario(page, address):
     page.goto(address)
-    page.locator("input.md-search__input").fill("torque_limit")
-    page.locator(".md-search-result__link", has_text="Imperfections").first.click()
+    result = page.locator(".md-search-result__link", has_text="Imperfections").first
+    for _ in range(20):  # the page may not listen yet when it has loaded
+        page.locator("input.md-search__input").fill("")
+        page.locator("input.md-search__input").fill("torque_limit")
+        with suppress(TimeoutError):
+            result.wait_for(timeout=2000)
+            break
+    result.click()
     page.locator("h1", has_text="Imperfections").wait_for()
     assert page.locator("code", has_text="torque_limit").count() > 0
 

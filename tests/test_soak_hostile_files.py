@@ -159,7 +159,7 @@ def test_many_problems_are_told_in_time(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text(TEXT + "".join(f"key{k}: 1\n" for k in range(5000)))
     before = time.process_time()
-    with pytest.raises(ScenarioError, match="5000 problems; allowed: none; here are some"):
+    with pytest.raises(ScenarioError, match=r"… and 4900 more$"):
         load_scenario(file)
     assert time.process_time() - before < 1.0
 

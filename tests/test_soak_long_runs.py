@@ -25,7 +25,7 @@ def own_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_long_runs_and_many_runs_stay_flat(tmp_path: Path) -> None:
-    prove(11, tmp_path)
+    prove(11, tmp_path, apart=True)
 
 
 def found(errand: Callable[[], None], count: int = 30) -> Tally:
@@ -55,7 +55,7 @@ def test_what_leaks_nothing_is_flat() -> None:
 @pytest.mark.parametrize(
     ("leak", "said"),
     [
-        (lambda kept, _: kept.append(np.ones(100_000)), "memory grows"),
+        (lambda kept, _: kept.append(np.ones(500_000)), "memory grows"),
         (lambda kept, _: kept.extend([] for _ in range(40)), "objects grows"),
         (lambda kept, folder: kept.append(os.open(folder, os.O_RDONLY)), "descriptors"),
         (lambda _, folder: tempfile.NamedTemporaryFile(dir=folder, delete=False).close(), "files"),

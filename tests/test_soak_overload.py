@@ -22,7 +22,8 @@ PERIOD = 5_000_000
 
 @pytest.mark.alone
 def test_misses_are_counted_guarded_and_got_over(tmp_path: Path) -> None:
-    prove(12, tmp_path)
+    """A machine that is busy with something else lets no recovery be seen, and the row says so."""
+    prove(12, tmp_path, may_be_left_out=("recovery at ordinary priority",))
 
 
 @pytest.fixture(scope="module")

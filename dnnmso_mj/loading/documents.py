@@ -18,7 +18,7 @@ from ruamel.yaml.reader import ReaderError
 
 from dnnmso_mj.wording import KeyPath, clean, dotted, shorten
 
-MAX_NODES = 12_000  # ruamel.yaml takes 0.05 ms for each
+MAX_NODES = 10_000  # ruamel.yaml takes 0.05 ms for each
 MAX_DEPTH = 32
 MAX_DIGITS = 100
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -17,6 +18,7 @@ from soak.tally import Form
 def main() -> int:
     """Run rows one after the other; 1 if anything was lost or let in."""
     arguments = _arguments()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # what was begun ends
     form = Form(long=not arguments.short, seed=arguments.seed)
     if arguments.into:
         with tempfile.TemporaryDirectory(prefix="dnnmso-soak-") as folder:

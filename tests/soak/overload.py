@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import random
 import subprocess
 import sys
@@ -75,7 +76,11 @@ class Paced:
         words += ["--", "paper", "--real-time", "--no-plot", "--json", "--out", "run.mcap"]
         words += [word for key, value in sets.items() for word in ("--set", f"{key}={value}")]
         with (folder / "out.json").open("w") as out, (folder / "err.txt").open("w") as err:
-            process = subprocess.Popen(words, cwd=folder, stdout=out, stderr=err, text=True)
+            path = os.pathsep.join(filter(None, [str(TESTS), os.environ.get("PYTHONPATH")]))
+            env = os.environ | {"PYTHONPATH": path}
+            process = subprocess.Popen(
+                words, cwd=folder, env=env, stdout=out, stderr=err, text=True
+            )
         try:
             yield process, _start(folder, process)
             process.wait(self.duration + 60)

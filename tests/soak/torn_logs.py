@@ -208,8 +208,8 @@ def places(readers: Readers, tally: Tally, original: Path, folder: Path) -> None
     there.mkdir()
     (there / "folder.mcap").mkdir()
     os.mkfifo(there / "fifo.mcap")
-    held = socket.socket(socket.AF_UNIX)
-    held.bind(os.path.relpath(there / "socket.mcap"))
+    with socket.socket(socket.AF_UNIX) as held:
+        held.bind(os.path.relpath(there / "socket.mcap"))
     (there / "loop.mcap").symlink_to("loop.mcap")
     (there / "dangling.mcap").symlink_to("nothing")
     (there / "empty.mcap").touch()
@@ -220,7 +220,6 @@ def places(readers: Readers, tally: Tally, original: Path, folder: Path) -> None
     devices = ["/dev/zero", "/dev/full", "/dev/null", "/proc/self/mem", "/proc/kmsg"]
     for path in [*sorted(there.iterdir()), *(Path(device) for device in devices)]:
         readers.judge(f"{path.name}", path, "damaged")
-    held.close()
     for name in (b"\xff\xfe.mcap", b"a\nb.mcap", b"\x1b[31m.mcap", b"[bold].mcap", b" .mcap"):
         path = Path(os.fsdecode(os.fsencode(there) + b"/" + name))
         path.write_bytes(original.read_bytes())
