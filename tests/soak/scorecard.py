@@ -54,9 +54,11 @@ def cells(found: dict[str, Any]) -> tuple[str, ...]:
 def markdown(results: Sequence[dict[str, Any]]) -> str:
     """Results as the part of the page between its two marks."""
     lines = [f"| {' | '.join(HEAD)} |", "|--:|---|--:|--:|--:|--:|---|--:|"]
-    lines += [f"| {' | '.join(cells(found))} |" for found in results]
-    missing = [row for row in ROWS if row.number not in {found["row"] for found in results}]
-    lines += [f"| {row.number} | {row.title} | | | | | not run | |" for row in missing]
+    found_of = {found["row"]: found for found in results}
+    for row in ROWS:
+        found = found_of.get(row.number)
+        empty = (str(row.number), row.title, "", "", "", "", "not run", "")
+        lines += [f"| {' | '.join(cells(found) if found else empty)} |"]
     lines += ["", "What each row measured, and on what:", ""]
     for found in results:
         lines += [f"**{found['row']}. {found['title']}.** {_of(found)}", ""]
@@ -96,17 +98,20 @@ def made_of() -> dict[str, str]:
     """The tree and the machine that a result is of."""
     from importlib.metadata import version
 
-    words = ["git", "describe", "--always", "--dirty", "--exclude", "*"]
-    commit = subprocess.run(
-        words, cwd=ROOT, capture_output=True, text=True, check=False
-    ).stdout.strip()
+    commit = _git("rev-parse", "--short", "HEAD")
+    changed = _git("status", "--porcelain", "--", ".", f":!{RESULTS.parent.name}/{RESULTS.stem}.*")
     versions = {name: version(name) for name in ("mujoco", "numpy", "numba")}
     return {
-        "commit": commit or "unknown",
+        "commit": (commit or "unknown") + (", changed" if changed else ""),
         "python": platform.python_version(),
         **versions,
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
     }
+
+
+def _git(*words: str) -> str:
+    done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    return done.stdout.strip()
 
 
 def _of(found: dict[str, Any]) -> str:
