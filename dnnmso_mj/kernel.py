@@ -152,15 +152,22 @@ def output_at(net: Net) -> int:
     return int(net.layers[-1, OUT])
 
 
+@inner
+def prediction(net: Net) -> Array:
+    """The f̂ (n_out,) of the last `forward`: a view of the last activations."""
+    out = output_at(net)
+    return net.acts[out : out + net.layers[-1, N_OUT]]
+
+
 @compiled
-def forward(net: Net, x: Array) -> Array:
-    """f̂(x) for x (n_in,): a view (n_out,) of the last activations."""
+def forward(net: Net, x: Array) -> None:
+    """f̂(x) for x (n_in,), to be had as `prediction(net)`."""
     copy(x, net.acts)
-    return propagate(net)
+    propagate(net)
 
 
 @compiled
-def propagate(net: Net) -> Array:
+def propagate(net: Net) -> None:
     """`forward` once more, with the x it had."""
     acts, n_layers, finite = net.acts, len(net.layers), True
     real = acts.dtype.type
@@ -177,8 +184,7 @@ def propagate(net: Net) -> Array:
             finite = finite and is_finite(acts[out : out + n_out])
             _activate(acts[out : out + n_out], net.activation)
     if not finite:
-        acts[out] = math.nan
-    return acts[out : out + n_out]
+        acts[output_at(net)] = math.nan
 
 
 @compiled
@@ -282,8 +288,7 @@ def learn(net: Net) -> None:
     The activations are those of the last `forward`; the output's deltas hold ∂loss/∂f̂. Where that
     `forward` was not finite nothing is learned: the weights stay as they ended the run.
     """
-    out = output_at(net)
-    if not is_finite(net.acts[out : out + net.layers[-1, N_OUT]]):
+    if not is_finite(prediction(net)):
         return
     net.updates[0] += 1
     if net.rule == MADAM:

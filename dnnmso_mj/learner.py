@@ -77,11 +77,13 @@ class KernelLearner:
         self.watch = monitors.build_watch(self.net, spec, watch)
         self.monitors = Monitors.zeros(shape.n_layers)
         out = kernel.output_at(self.net)
+        self._output = self.net.acts[out : out + shape.sizes[-1]]
         self._delta = self.net.deltas[out : out + shape.sizes[-1]]
         self._prediction = np.zeros(shape.sizes[-1])
 
     def predict(self, x: Array) -> Array:
-        self._prediction[:] = kernel.forward(self.net, x)
+        kernel.forward(self.net, x)
+        self._prediction[:] = self._output
         return self._prediction
 
     def learn(self, delta: Array) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from dnnmso_mj.compiling import compiled, copy, inner
 from dnnmso_mj.inversion import DynamicInversion, solve_spd
-from dnnmso_mj.kernel import Net, forward
+from dnnmso_mj.kernel import Net, forward, prediction
 from dnnmso_mj.plant import inertia
 from dnnmso_mj.scenario import KnownDelay
 
@@ -86,7 +86,8 @@ def predict(
             predictor.mean[j] = 0.0
             for i in range(first, first + count):
                 predictor.mean[j] += predictor.tau[i, j] / count
-        output = forward(net, ahead)
+        forward(net, ahead)
+        output = prediction(net)
         if inversion.constant:
             for j in range(n):
                 predictor.free[j] = predictor.mean[j] / inversion.B2_inv[j, j]

@@ -12,9 +12,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from numba.core.errors import NumbaError
 
 import dnnmso_mj
 from dnnmso_mj.compile_loop import _whole
+from dnnmso_mj.compiling import compiled
 from dnnmso_mj.controllers import compiled_ticks
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.memory_recorder import MemoryRecorder
@@ -189,3 +191,13 @@ def test_a_scenario_cut_short_of_its_events_can_be_compiled_elsewhere():
     assert read.events == whole.events
     assert 20.0 < read.duration < 20.01
     assert Scenario.model_validate_json(_whole(whole)) == whole
+
+
+def test_what_allocates_does_not_compile():
+    """So that no tick does: each function of the loop is compiled this way."""
+
+    def doubled(values: np.ndarray) -> float:
+        return (2.0 * values).sum()
+
+    with pytest.raises(NumbaError, match="NRT"):
+        compiled(doubled)(np.ones(3))

@@ -20,7 +20,7 @@ from dnnmso_mj import monitors
 from dnnmso_mj.backstepping import Law, act, build_law, held, observe
 from dnnmso_mj.compiling import copy, inner
 from dnnmso_mj.controllers import LEARNING, MODEL_ALONE, Command, CompiledTicks, Inputs
-from dnnmso_mj.kernel import Net, forward, output_at
+from dnnmso_mj.kernel import Net, forward, output_at, prediction
 from dnnmso_mj.learner import KernelLearner, build_learner
 from dnnmso_mj.monitors import Watch
 from dnnmso_mj.observer import start
@@ -124,7 +124,8 @@ def update(parts: Parts, inputs: Inputs) -> None:
     law, net, known = parts.law, parts.net, parts.known
     observe(law, inputs)
     copy(law.observer.x_hat, parts.command.x_hat)
-    output = forward(net, inputs.x)
+    forward(net, inputs.x)
+    output = prediction(net)
     for i in range(output.size):
         law.f_hat[known + i] += output[i]
     act(law, inputs, inputs.frozen[0] != MODEL_ALONE)

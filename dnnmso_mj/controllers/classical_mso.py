@@ -23,7 +23,7 @@ from dnnmso_mj import monitors
 from dnnmso_mj.compiling import copy, inner
 from dnnmso_mj.controllers import LEARNING, Command, CompiledTicks, Inputs, command_of
 from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert, solve_spd
-from dnnmso_mj.kernel import Net, forward, output_at
+from dnnmso_mj.kernel import Net, forward, output_at, prediction
 from dnnmso_mj.learner import KernelLearner, build_learner
 from dnnmso_mj.monitors import Watch
 from dnnmso_mj.observer import (
@@ -188,7 +188,8 @@ def _known(law: Law, x: Array, out: Array) -> None:
 def update(parts: Parts, inputs: Inputs) -> None:
     """One tick of the law above."""
     law, net = parts.law, parts.net
-    command_with(law, parts.command, forward(net, inputs.x), inputs)
+    forward(net, inputs.x)
+    command_with(law, parts.command, prediction(net), inputs)
     if inputs.frozen[0] == LEARNING:
         delta = output_at(net)
         for i in range(law.delta.size):

@@ -18,7 +18,7 @@ from dnnmso_mj import monitors
 from dnnmso_mj.compiling import copy, inner
 from dnnmso_mj.controllers import LEARNING, Command, CompiledTicks, Inputs, command_of
 from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert
-from dnnmso_mj.kernel import Net, forward, output_at
+from dnnmso_mj.kernel import Net, forward, output_at, prediction
 from dnnmso_mj.learner import KernelLearner, build_learner
 from dnnmso_mj.monitors import Watch
 from dnnmso_mj.observer import (
@@ -134,7 +134,8 @@ def update(parts: Parts, inputs: Inputs) -> None:
     correct(observer, parts.inversion, inputs.tau)
     compare(observer, x)
     copy(observer.x_hat, command.x_hat)
-    output = forward(net, x)
+    forward(net, x)
+    output = prediction(net)
     for i in range(known):
         command.f_hat[i] = x[known + i]
     for i in range(output.size):

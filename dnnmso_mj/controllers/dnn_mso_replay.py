@@ -46,7 +46,7 @@ from dnnmso_mj.controllers import (
     command_of,
 )
 from dnnmso_mj.inversion import DynamicInversion, build_inversion, invert, solve_spd
-from dnnmso_mj.kernel import Net, forward, output_at
+from dnnmso_mj.kernel import Net, forward, output_at, prediction
 from dnnmso_mj.kernel import learn as learn_once
 from dnnmso_mj.learner import KernelLearner
 from dnnmso_mj.memory import (
@@ -207,7 +207,9 @@ class DnnMsoReplayController:
         return self._command
 
     def dynamics(self, x: Array) -> Array:
-        return forward(self._mean, x).astype(float)
+        forward(self._mean, x)
+        out = output_at(self._mean)
+        return self._mean.acts[out : out + x.size // 2].astype(float)
 
     def state(self) -> dict[str, Array]:
         law = self._law
@@ -284,10 +286,8 @@ def act(parts: Parts, inputs: Inputs) -> None:
     if len(law.predictor.tau) > 1:
         predict(law.predictor, law.inversion, net, inputs.x, law.d_hat)
         ahead = law.predictor.x
-        delta = output_at(net)
         forward(net, ahead)
-        for i in range(n):
-            law.free[i] = net.acts[delta + i]
+        copy(prediction(net), law.free)
         output = law.free
     for i in range(n):
         law.f_used[i], law.f_used[n + i] = ahead[n + i], output[i] + law.d_hat[i]
@@ -320,7 +320,8 @@ def learn(parts: Parts, inputs: Inputs) -> None:
     share = min(1.0, math.sqrt(wrong) / law.error)
     eta = law.eta_min + (law.eta_0 - law.eta_min) * share
     delta = output_at(net)
-    output = forward(net, inputs.x)
+    forward(net, inputs.x)
+    output = prediction(net)
     for i in range(n):
         net.deltas[delta + i] = output[i] - parts.command.f_hat[n + i] - law.z[i]
         law.label[i] = law.f_lagged[i] + law.z[i]
@@ -333,7 +334,8 @@ def learn(parts: Parts, inputs: Inputs) -> None:
     if memory.counts[SIZE] > 0:
         for _ in range(law.samples):
             entry = recall(memory)
-            output = forward(net, memory.recalled)
+            forward(net, memory.recalled)
+            output = prediction(net)
             wrong = 0.0
             for i in range(n):
                 net.deltas[delta + i] = output[i] - memory.label[entry, i]
@@ -356,7 +358,8 @@ def update(parts: Parts, inputs: Inputs) -> None:
     """One tick of the law above."""
     law, command, n = parts.law, parts.command, parts.law.d_hat.size
     observe(law, command, inputs)
-    output = forward(parts.mean, inputs.x)
+    forward(parts.mean, inputs.x)
+    output = prediction(parts.mean)
     for i in range(n):
         command.f_hat[i], command.f_hat[n + i] = inputs.x[n + i], output[i]
     if law.ticks[0] == 0:
