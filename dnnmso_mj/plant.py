@@ -349,21 +349,25 @@ class NominalModel:
 @inner
 def inertia(nominal: Nominal, q: Array) -> None:
     """M(q) into `nominal.M`; of a q that is not finite, which MuJoCo never sees, no number is."""
-    if not is_finite(q):
-        nominal.M.fill(math.nan)
-        return
-    copy(q, nominal.q)
-    mj_kinematics(nominal.model, nominal.data)
-    mj_comPos(nominal.model, nominal.data)
-    mj_makeM(nominal.model, nominal.data)
-    mj_fullM(nominal.model, nominal.data, nominal.M.ctypes.data)
+    finite = True
+    for j in range(q.size):
+        nominal.q[j], finite = q[j], finite and math.isfinite(q[j])
+    if finite:
+        mj_kinematics(nominal.model, nominal.data)
+        mj_comPos(nominal.model, nominal.data)
+        mj_makeM(nominal.model, nominal.data)
+        mj_fullM(nominal.model, nominal.data, nominal.M.ctypes.data)
+    else:
+        for j in range(q.size):
+            nominal.M[j, j] = math.nan
 
 
 @compiled
 def bias(nominal: Nominal, q: Array, qd: Array) -> None:
     """V(q, q̇) + G(q) into `nominal.bias`; as `inertia`."""
     if not (is_finite(q) and is_finite(qd)):
-        nominal.bias.fill(math.nan)
+        for j in range(q.size):
+            nominal.bias[j] = math.nan
         return
     copy(q, nominal.q)
     copy(qd, nominal.qd)

@@ -15,13 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dnnmso_mj.compiling import inner
+from dnnmso_mj.compiling import compiled, inner
 from dnnmso_mj.scenario import Safety as SafetySpec
 from dnnmso_mj.scenario import expand
 from dnnmso_mj.trace import Array
 
 # Rows of `Safety.limits`: what is allowed, the brake, and the state in which it took hold.
 Q_MIN, Q_MAX, QD_MAX, STIFFNESS, DAMPING, Q_STOP, QD_STOP = range(7)
+
+FREE, STOPPING, STOPPED = range(3)  # the last tick of a stop is STOPPED
 
 STANDS_FOR = 0.1  # s; an arm that turns round is at rest for less
 
@@ -62,43 +64,39 @@ def start_safety(safety: Safety) -> None:
 
 
 @inner
-def is_stopping(safety: Safety, x: Array, k: int) -> bool:
-    """Whether the stop acts in tick k, of an arm at x (2n,)."""
-    n, limits = x.size // 2, safety.limits
-    if safety.ticks[0] == 0:
+def guard(safety: Safety, x: Array, k: int, tau: Array) -> int:
+    """FREE, STOPPING or STOPPED: whether the stop acts in tick k, of an arm at x (2n,).
+
+    Its torque (n,) N·m goes into `tau`; without limits nothing is done.
+    """
+    if not safety.guards:
+        return FREE
+    return _guard(safety.limits, safety.ticks, safety.ends, safety.standstill, x, k, tau)
+
+
+@compiled
+def _guard(
+    limits: Array, ticks: Array, ends: Array, standstill: float, x: Array, k: int, tau: Array
+) -> int:
+    n = tau.size
+    if ticks[0] == 0:
         passed = False
         for j in range(n):
-            if not (limits[Q_MIN, j] <= x[j] <= limits[Q_MAX, j]):
-                passed = True
-            if abs(x[n + j]) > limits[QD_MAX, j]:
-                passed = True
+            within = limits[Q_MIN, j] <= x[j] <= limits[Q_MAX, j]
+            passed = passed or not within or abs(x[n + j]) > limits[QD_MAX, j]
         if not passed:
-            return False
-        safety.ticks[0] = k + 1
+            return FREE
+        ticks[0] = k + 1
         for j in range(n):
             limits[Q_STOP, j], limits[QD_STOP, j] = x[j], x[n + j]
-    safety.ticks[1] += 1
+    ticks[1] += 1
     for j in range(n):
-        if abs(x[n + j]) > safety.standstill:
-            safety.ticks[1] = 0
-    return True
-
-
-@inner
-def stop(safety: Safety, x: Array, tau: Array) -> Array:
-    """The stop's torque (n,) N·m, into `tau`."""
-    n, limits = tau.size, safety.limits
-    for j in range(n):
+        if abs(x[n + j]) > standstill:
+            ticks[1] = 0
         bend = x[j] - limits[Q_STOP, j]
         tau[j] = -limits[STIFFNESS, j] * bend - limits[DAMPING, j] * x[n + j]
-    return tau
-
-
-@inner
-def has_stopped(safety: Safety, k: int) -> bool:
-    """Whether the stop is over with tick k."""
-    lasted = k + 2 - safety.ticks[0]
-    return bool(lasted >= safety.ends[0] or safety.ticks[1] >= safety.ends[1])
+    over = k + 2 - ticks[0] >= ends[0] or ticks[1] >= ends[1]
+    return STOPPED if over else STOPPING
 
 
 def what_tripped(spec: SafetySpec, safety: Safety) -> str:

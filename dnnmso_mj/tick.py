@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from dnnmso_mj.clock import now_ns, sleep_until
-from dnnmso_mj.compiling import compiled, copy, inner, is_finite
+from dnnmso_mj.compiling import compiled, copy, inner
 from dnnmso_mj.imperfections.actuators import GIVEN, Actuators, actuate
 from dnnmso_mj.imperfections.loads import BEFORE, Loads, load
 from dnnmso_mj.imperfections.sensors import Sensors, sense
 from dnnmso_mj.inversion import solve_spd
 from dnnmso_mj.plant import Nominal, PlantView, inertia, integrate, solve_inertia
-from dnnmso_mj.safety import Safety, has_stopped, is_stopping, stop
+from dnnmso_mj.safety import FREE, STOPPED, Safety, guard
 from dnnmso_mj.theory import TrackingBounds, begin_period, end_period
 
 if TYPE_CHECKING:
@@ -140,15 +140,15 @@ def begin_tick(world: World, k: int) -> bool:
         world.x[j], world.x[n + j] = plant.q[j], plant.qd[j]
         inputs.tau[j] = world.tau[j]
     sense(world.sensors, world.x, k, i, inputs.x)
+    there = told = True
     for j in range(2 * n):
         world.x_ref[j], world.xd_ref[j] = world.reference[i, j], world.reference[i, n + j]
         inputs.x_ref[j], inputs.xd_ref[j] = world.ahead[i, j], world.ahead[i, n + j]
         world.e_track[j] = world.x[j] - world.x_ref[j]
-        if not math.isfinite(world.x[j]):
-            world.counts[STATUS] = STATE_NOT_FINITE
-        elif not math.isfinite(inputs.x[j]) and world.counts[STATUS] == RUNNING:
-            world.counts[STATUS] = READING_NOT_FINITE
-    return in_time and world.counts[STATUS] == RUNNING
+        there, told = there and math.isfinite(world.x[j]), told and math.isfinite(inputs.x[j])
+    if not (there and told):
+        world.counts[STATUS] = READING_NOT_FINITE if there else STATE_NOT_FINITE
+    return in_time and there and told
 
 
 @inner
@@ -170,20 +170,20 @@ def end_tick(world: World, command: Command, k: int) -> bool:
         return True
     missed = world.pace.period_ns > 0 and _too_late(world, k)
     world.counts[MISSED] = 1 if missed else 0
-    stopping = world.safety.guards and is_stopping(world.safety, world.x, k)
-    saturated = actuate(world.actuators, _wanted(world, command, missed, stopping), k)
+    stop = guard(world.safety, world.x, k, world.qdd)
+    saturated = actuate(world.actuators, _wanted(world, command, missed, stop), k)
     tau = world.actuators.tau
     if not _drive(world, tau):
         return True
     if k > 0:
         _end_period(world, tau)
-    _true_dynamics(world, command, tau, saturated or missed or stopping)
+    _true_dynamics(world, command, tau, saturated or missed or stop != FREE)
     if not _record(world, command, k, saturated, missed):
         return True
     if _is_out_of_range(world, command):
         world.counts[STATUS] = OUT_OF_RANGE
         return True
-    if stopping and has_stopped(world.safety, k):
+    if stop == STOPPED:
         world.counts[STATUS] = SAFELY_STOPPED
         return True
     qdd_ref = world.xd_ref[tau.size :]
@@ -194,10 +194,10 @@ def end_tick(world: World, command: Command, k: int) -> bool:
 
 
 @inner
-def _wanted(world: World, command: Command, missed: bool, stopping: bool) -> Array:
-    """The torque (n,) N·m that the drives are given."""
-    if stopping:
-        return stop(world.safety, world.x, world.qdd)
+def _wanted(world: World, command: Command, missed: bool, stop: int) -> Array:
+    """The torque (n,) N·m that the drives are given; that of the safe stop is in `qdd`."""
+    if stop != FREE:
+        return world.qdd
     if missed:
         return _watchdog(world)
     return command.tau
@@ -206,13 +206,16 @@ def _wanted(world: World, command: Command, missed: bool, stopping: bool) -> Arr
 @inner
 def _drive(world: World, tau: Array) -> bool:
     """True q̈ under τ (n,) N·m and all loads; False where MuJoCo may not be given one of them."""
-    status = RUNNING
+    status, moved = RUNNING, False
+    q, qd = world.plant.q, world.plant.qd
     for j in range(tau.size):
         if not math.isfinite(tau[j]):
             status = TAU_NOT_FINITE
         elif abs(tau[j]) > MUJOCO_ZEROES_ABOVE and status == RUNNING:
             status = TAU_TOO_LARGE
-    if not (is_finite(world.plant.q) and is_finite(world.plant.qd)):
+        if not (math.isfinite(q[j]) and math.isfinite(qd[j])):
+            moved = True
+    if moved:
         status = STATE_NOT_FINITE  # changed from outside since the tick began
     if status == RUNNING and not load(world.loads, world.plant, tau, world.dt, MUJOCO_ZEROES_ABOVE):
         status = LOAD_TOO_LARGE

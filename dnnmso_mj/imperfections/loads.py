@@ -90,10 +90,12 @@ def load(loads: Loads, plant: PlantView, tau: Array, dt: float, most: float) -> 
             )
             for j in range(tau.size):
                 loads.torque[j] += loads.held[FRICTION, j]
-    if not is_within(loads.torque, most):
-        return False
-    forward(plant, tau)
-    return True
+    within = True
+    for j in range(tau.size):
+        within = within and abs(loads.torque[j]) <= most
+    if within:
+        forward(plant, tau)
+    return within
 
 
 @compiled
