@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,72 +36,74 @@ SURROUNDINGS: dict[str, Mapping[str, str]] = {
 NOBODY = "rerun+http://127.0.0.1:9/proxy"  # where no viewer is
 
 
+class Known(NamedTuple):
+    """Trials, and the digest that each gave when it first ran."""
+
+    trials: Mapping[str, Trial]
+    digests: Mapping[str, str]
+
+
 def run(form: Form, tally: Tally, folder: Path) -> None:
     """All trials here first; then the same ones in every other way."""
     asked = trials(folder, form.seed, form.pick(0.2, 1.0))
-    expected = {name: trial.digest() for name, trial in asked.items()}
+    known = Known(asked, {name: trial.digest() for name, trial in asked.items()})
     tally.figure("scenarios", len(asked))
-    repeats(form, tally, asked, expected)
-    in_another_order(form, tally, asked, expected)
-    in_threads_and_forks(form, tally, asked, expected)
-    logs(form, tally, folder, asked, expected)
-    processes(form, tally, folder, asked, expected)
-    cold(form, tally, folder, asked, expected)
+    repeats(form, tally, known)
+    in_another_order(form, tally, known)
+    in_threads_and_forks(form, tally, known)
+    logs(form, tally, folder, known)
+    processes(form, tally, folder, known)
+    cold(form, tally, folder, known)
     sweeps(form, tally, folder)
     golden_hashes(form, tally)
 
 
-def compare(tally: Tally, what: str, found: Mapping[str, str], expected: Mapping[str, str]) -> None:
+def compare(tally: Tally, what: str, found: Mapping[str, str], known: Known) -> None:
     """Count each digest that is as expected, and name the others."""
     for name, value in found.items():
-        if value == expected[name]:
+        expected = known.digests[name]
+        if value == expected:
             tally.survive()
         else:
-            tally.lose(f"{name}, {what}: {value[:12]}, and not {expected[name][:12]}")
+            tally.lose(f"{name}, {what}: {value[:12]}, and not {expected[:12]}")
 
 
-def repeats(
-    form: Form, tally: Tally, asked: Mapping[str, Trial], expected: Mapping[str, str]
-) -> None:
+def repeats(form: Form, tally: Tally, known: Known) -> None:
     """Again and again in this process, from anew."""
     count = form.pick(5, 100)
     tally.figure("repeats in one process", count)
     for k in range(count):
-        found = {name: trial.digest() for name, trial in asked.items()}
-        compare(tally, f"repeat {k}", found, expected)
+        found = {name: trial.digest() for name, trial in known.trials.items()}
+        compare(tally, f"repeat {k}", found, known)
 
 
-def in_another_order(
-    form: Form, tally: Tally, asked: Mapping[str, Trial], expected: Mapping[str, str]
-) -> None:
+def in_another_order(form: Form, tally: Tally, known: Known) -> None:
     """After other scenarios, in a random order, and between runs of other seeds."""
     rng = np.random.default_rng(form.seed)
     for _ in range(form.pick(1, 10)):
-        for name in rng.permutation(list(asked)).tolist():
+        for name in rng.permutation(list(known.trials)).tolist():
             other = load_scenario("paper", [f"seed={rng.integers(1000)}", "duration=0.02"])
             simulate(other, watch=bool(rng.integers(2)))
-            compare(tally, "in another order", {name: asked[name].digest()}, expected)
+            compare(tally, "in another order", {name: known.trials[name].digest()}, known)
 
 
-def in_threads_and_forks(
-    form: Form, tally: Tally, asked: Mapping[str, Trial], expected: Mapping[str, str]
-) -> None:
+def in_threads_and_forks(form: Form, tally: Tally, known: Known) -> None:
     """All at once, each in a thread of its own; then in a forked process."""
     for _ in range(form.pick(1, 5)):
         found: dict[str, str] = {}
 
         def work(name: str, into: dict[str, str] = found) -> None:
-            into[name] = asked[name].digest()
+            into[name] = known.trials[name].digest()
 
-        threads = [threading.Thread(target=work, args=(name,)) for name in asked]
+        threads = [threading.Thread(target=work, args=(name,)) for name in known.trials]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-        for name in asked:
-            compare(tally, "in a thread", {name: found.get(name, "no run")}, expected)
-    for name, trial in asked.items():
-        compare(tally, "after a fork", {name: forked(trial.digest)}, expected)
+        for name in known.trials:
+            compare(tally, "in a thread", {name: found.get(name, "no run")}, known)
+    for name, trial in known.trials.items():
+        compare(tally, "after a fork", {name: forked(trial.digest)}, known)
 
 
 def forked(work: Callable[[], str]) -> str:
@@ -119,21 +122,15 @@ def forked(work: Callable[[], str]) -> str:
     return said or "no run"
 
 
-def logs(
-    form: Form,
-    tally: Tally,
-    folder: Path,
-    asked: Mapping[str, Trial],
-    expected: Mapping[str, str],
-) -> None:
+def logs(form: Form, tally: Tally, folder: Path, known: Known) -> None:
     """Logged twice, once with a live view; and without monitors."""
-    for name, trial in asked.items():
+    for name, trial in known.trials.items():
         scenario, files = trial.scenario(), list[Path]()
         for view in (False, True):
             with live(folder / "live.rrd", form.long) if view else no_view() as watcher:
                 out = folder / f"{name}-{view}.mcap"
                 done = run_logged(scenario, out, live=watcher)
-            compare(tally, f"logged, live view: {view}", {name: digest(done.trace)}, expected)
+            compare(tally, f"logged, live view: {view}", {name: digest(done.trace)}, known)
             files.append(done.log)
         with tally.case(f"{name}: two logs, byte for byte but for the wall clock"):
             assert log_digest(files[0]) == log_digest(files[1])
@@ -166,16 +163,10 @@ def live(out: Path, viewer: bool) -> Iterator[LiveView]:
             yield view
 
 
-def processes(
-    form: Form,
-    tally: Tally,
-    folder: Path,
-    asked: Mapping[str, Trial],
-    expected: Mapping[str, str],
-) -> None:
+def processes(form: Form, tally: Tally, folder: Path, known: Known) -> None:
     """In fresh processes, two at once, in other surroundings and elsewhere."""
-    names = list(asked)
-    given = [asked[name] for name in names]
+    names = list(known.trials)
+    given = [known.trials[name] for name in names]
     places = {"elsewhere": partial(elsewhere, given, cwd=folder)}
     for what, env in list(SURROUNDINGS.items())[: form.pick(1, len(SURROUNDINGS))]:
         places[what] = partial(elsewhere, given, env=env)
@@ -186,20 +177,14 @@ def processes(
         for what, process in [(what, start()) for what, start in pair]:
             with tally.case(f"a process ({what})"):
                 found = dict(zip(names, answers(process), strict=True))
-                compare(tally, f"a process ({what})", found, expected)
+                compare(tally, f"a process ({what})", found, known)
     tally.figure("processes, two at once", len(places))
 
 
-def cold(
-    form: Form,
-    tally: Tally,
-    folder: Path,
-    asked: Mapping[str, Trial],
-    expected: Mapping[str, str],
-) -> None:
+def cold(form: Form, tally: Tally, folder: Path, known: Known) -> None:
     """With nothing compiled: by the process that compiles, then by one that finds it done."""
     names = form.pick(["pd, dt 0.5 ms"], ["pd, dt 0.5 ms", "paper", "policy"])
-    given = [asked[name] for name in names]
+    given = [known.trials[name] for name in names]
     cache = folder / "cold"
     # In the long form two processes compile the same at once.
     for what, at_once in (("cold", form.pick(1, 2)), ("warm", 1)):
@@ -208,7 +193,7 @@ def cold(
         ]:
             with tally.case(f"compiled code, {what}"):
                 found = dict(zip(names, answers(process), strict=True))
-                compare(tally, f"compiled code, {what}", found, expected)
+                compare(tally, f"compiled code, {what}", found, known)
 
 
 def sweeps(form: Form, tally: Tally, folder: Path) -> None:
