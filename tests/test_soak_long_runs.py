@@ -72,6 +72,19 @@ def test_a_leak_is_lost(
     assert any(lost.startswith(said) for lost in tally.lost), tally.lost
 
 
+def test_memory_that_an_allocator_takes_once_is_no_leak(kept: list[object]) -> None:
+    """At any time of the runs that are judged."""
+    for when in range(16, 30):
+        turns = iter(range(30))
+
+        def errand(when: int = when, turns: Iterator[int] = turns) -> None:
+            if next(turns) == when:
+                kept.append(np.ones(1_000_000))
+
+        tally = found(errand)
+        assert not any(lost.startswith("memory") for lost in tally.lost), (when, tally.lost)
+
+
 def test_a_thread_that_stays_is_lost(kept: list[object]) -> None:
     def start() -> None:
         end = threading.Event()
