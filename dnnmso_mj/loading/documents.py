@@ -97,6 +97,9 @@ def read_document(text: str) -> tuple[Node | None, list[Problem]]:
         line = text.count("\n", 0, error.position) + 1
         what = f"not valid YAML: the character U+{error.character:04X} is not allowed"
         return None, [Problem(line, what)]
+    except AssertionError:  # so ruamel.yaml puts it
+        what = "a directive %YAML of a version that is none; allowed: YAML 1.2"
+        return None, [*builder.problems, Problem(builder.line, what)]
     except (YAMLError, ValueError, OverflowError):  # the escape \UFFFFFFFF, from line on
         what = "not valid YAML: an escape or a directive that stands for nothing"
         return None, [*builder.problems, Problem(builder.line, what)]

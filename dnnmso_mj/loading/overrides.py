@@ -18,7 +18,7 @@ from typing import Any
 
 from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading.complaints import Complaint, complain
-from dnnmso_mj.loading.documents import read_document
+from dnnmso_mj.loading.documents import MAX_DEPTH, read_document
 from dnnmso_mj.loading.shape import ABSENT, Shape, lookup
 from dnnmso_mj.loading.trust import anchored
 from dnnmso_mj.wording import KeyPath, clean, dotted, shorten, show
@@ -82,6 +82,8 @@ def _parse(text: str) -> Override | str:
         return f"{place}: no '='; {FORM}"
     if not all(path):
         return f"{place}: an empty key; {FORM}"
+    if len(path) > MAX_DEPTH:
+        return f"{place}: {len(path)} keys deep; allowed: at most {MAX_DEPTH}"
     root, problems = read_document(value)
     if problems:
         return f"{place}: {problems[0].text}"

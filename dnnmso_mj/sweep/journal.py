@@ -238,10 +238,10 @@ class Journal:
         return lines
 
     def _write(self, line: str) -> None:
-        data = f"{line}\n".encode()
+        rest = f"{line}\n".encode()
         with _writing(self._path):
-            if os.write(self._file, data) < len(data):
-                raise OSError(None, "no space left for a whole row")
+            while rest:  # what a full disk took in part says why when the rest is asked of it
+                rest = rest[os.write(self._file, rest) :]
 
     def _size(self) -> int:
         return os.fstat(self._file).st_size

@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import os
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -244,9 +245,8 @@ def _scenario(text: str) -> dict[str, bytes]:
 
 def _logs(rng: random.Random, count: int, place: Place, attempt: Attempt) -> None:
     """What a log holds: a model with files, put in a folder, and a scenario to go on from."""
-    models = list(hostile_mjcf.models(rng, 1, str(place.folder)))
-    for what, files in rng.sample(models, count):
-        text = files["arm.xml"].decode("utf-8", "replace")
+    models = list(_texts(hostile_mjcf.models(rng, 1, str(place.folder))))
+    for what, text in rng.sample(models, min(count, len(models))):
         kept = {"asset/../outside/secret.stl": b"new", "asset/..": b"new", "asset/a/..": b"new"}
         attempt(f"log: {what}", lambda text=text, kept=kept: _put_back(text, kept), "plant.model")
     for name in ("..", "a/..", "x" * 300 + ".stl", "a&#10;b.stl"):
@@ -270,6 +270,13 @@ def _logs(rng: random.Random, count: int, place: Place, attempt: Attempt) -> Non
             lambda scenario=scenario: change_scenario(scenario, (), log),
             "log.mcap",
         )
+
+
+def _texts(models: Iterable[tuple[str, dict[str, bytes]]]) -> Iterator[tuple[str, str]]:
+    """Of models, those that a log can hold: it has text, and not bytes of another encoding."""
+    for what, files in models:
+        with suppress(UnicodeDecodeError):
+            yield what, files["arm.xml"].decode()
 
 
 def _put_back(text: str, kept: dict[str, bytes]) -> None:

@@ -96,7 +96,7 @@ def result(which: Row, form: Form, tally: Tally, seconds: float) -> dict[str, An
     for key in ("lost", "let_in"):
         listed = found[key]
         found[key] = len(listed)
-        found[f"{key}_first"] = listed[:SHOWN]
+        found[f"{key}_first"] = list(dict.fromkeys(listed))[:SHOWN]
     return found
 
 
