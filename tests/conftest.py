@@ -48,8 +48,13 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The rows of the scorecard first: each takes long, and no worker shall end alone with one."""
-    items.sort(key=lambda item: not item.path.name.startswith("test_soak"))
+    """What runs alone first, while there is nothing long to wait for; then the other rows of the
+    scorecard: each takes long, and no worker shall end alone with one.
+    """
+    alone = {item.path for item in items if item.get_closest_marker("alone")}
+    items.sort(
+        key=lambda item: (item.path not in alone, not item.path.name.startswith("test_soak"))
+    )
 
 
 @pytest.hookimpl(wrapper=True)
