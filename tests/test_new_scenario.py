@@ -15,7 +15,7 @@ from dnnmso_mj.errors import ScenarioError
 from dnnmso_mj.loading import controller_kinds, load_scenario
 from dnnmso_mj.margins.rows import is_model_free
 from dnnmso_mj.new_scenario import new_scenario
-from dnnmso_mj.paths import scenario_names, shipped_controllers
+from dnnmso_mj.paths import scenario_names, scenarios_dir, shipped_controllers
 
 ROOT = Path(__file__).parents[1]
 
@@ -52,7 +52,9 @@ def test_every_key_is_there_with_its_meaning_its_default_and_its_range(tmp_path)
         "# Gravitational acceleration, along -z (m/s²). Default 9.81; allowed: a number >= 0."
     )
     assert "Allowed: adrc, backstepping, " in flat
-    assert max(map(len, text.splitlines())) <= 100
+    paths = ("$schema=", str(tmp_path))  # these are as long as they are
+    lines = [line for line in text.splitlines() if not any(path in line for path in paths)]
+    assert max(map(len, lines)) <= 100
 
 
 def parts(part: BaseModel) -> list[BaseModel]:
@@ -67,8 +69,8 @@ def parts(part: BaseModel) -> list[BaseModel]:
 def test_an_editor_finds_the_schema_from_where_the_file_is(tmp_path, monkeypatch):
     file = new_scenario("mine", out=tmp_path / "a b" / "mine.yaml")
     first = file.read_text(encoding="utf-8").splitlines()[0]
-    assert first == f"# yaml-language-server: $schema={ROOT}/scenarios/scenario.schema.json"
-    monkeypatch.chdir(ROOT)
+    assert first == f"# yaml-language-server: $schema={scenarios_dir()}/scenario.schema.json"
+    monkeypatch.chdir(scenarios_dir().parent)
     from dnnmso_mj.new_scenario import scenario_text
 
     inside = scenario_text(load_scenario("paper"), Path("scenarios/literature/x.yaml"), "paper")
