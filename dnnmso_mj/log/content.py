@@ -99,8 +99,8 @@ class LogContent:
 
     @property
     def ticks(self) -> int:
-        """How many it was given."""
-        return self._written + self._filled
+        """How many are written."""
+        return self._written
 
     def take(self, rows: Array) -> None:
         """Add rows to the block in progress, and write it once it holds enough."""
