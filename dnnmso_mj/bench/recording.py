@@ -29,7 +29,7 @@ from dnnmso_mj.trace import FLAGS, SCALARS, RunInfo, StepLayout
 
 Array = np.ndarray
 
-BLOCK = 50  # ticks
+BLOCK = 20  # ticks, as the loop of a paced run gives them
 PERIOD_NS = 200_000  # between two ticks: five times real time, the loop's thread asleep between
 
 
@@ -48,7 +48,9 @@ class OurLog:
 
     def __init__(self, path: Path, run: _Run) -> None:
         scene = Scene(run.simulation.plant.model)
-        self._recorder = McapRecorder(path, run.layout, run.scenario, scene, run.mjcf.text)
+        self._recorder = McapRecorder(
+            path, run.layout, run.scenario, scene, run.mjcf.text, real_time=True
+        )
         self.append = self._recorder.append
 
     def close(self) -> None:
