@@ -35,6 +35,7 @@ PLANTED = (
 NOT_FROM_A_WHEEL = (
     "--ignore-glob=tests/test_soak*",
     "--ignore=tests/test_site.py",
+    "--ignore=tests/test_unsafe_code.py",
     "--deselect=tests/test_paths.py::test_an_installed_wheel_finds_its_models_and_scenarios",
     "--deselect=tests/test_paths.py::test_a_checkout_has_models_and_scenarios_at_its_top",
     "--deselect=tests/test_docs.py::test_every_link_on_the_page_leads_to_a_file",
