@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 from soak import accounts
+from soak.overload import recovery
 from soak.proof import prove
 
 from dnnmso_mj.memory_recorder import MemoryRecorder
@@ -100,3 +102,15 @@ def test_a_stamped_tick_that_was_late_must_be_flagged_and_no_other(hung) -> None
         other = stamps.copy()
         other[np.flatnonzero(missed == flag)[0], 2:] += shift
         assert said in accounts.against_stamps(trace, other, start, PERIOD)[0][0]
+
+
+@pytest.mark.parametrize(
+    ("n_ticks", "part", "lost"), [(1500, 0.02, 0), (1500, 0.08, 1), (57, 0.035, 0), (57, 0.16, 1)]
+)
+def test_deadlines_still_missed_after_a_load_are_lost(n_ticks: int, part: float, lost: int) -> None:
+    t = np.arange(4000) / 1000
+    missed = np.zeros(4000, bool)
+    missed[700 + np.linspace(0, n_ticks - 1, round(part * n_ticks)).astype(int)] = True
+    trace = cast(Trace, {"t": t, "deadline_missed": missed})
+    loads = [(0.1, 0.4), (0.7 + n_ticks / 1000 + 0.01, 3.9)]
+    assert len(recovery(trace, loads, 0.0)) == lost
