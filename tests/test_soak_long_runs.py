@@ -14,7 +14,7 @@ import pytest
 from log_samples import LAYOUT, OK, recorder, rows
 from soak.long_runs import check_times, repeat
 from soak.proof import prove
-from soak.resources import judge
+from soak.resources import Sample, judge
 from soak.tally import Tally
 
 
@@ -72,17 +72,14 @@ def test_a_leak_is_lost(
     assert any(lost.startswith(said) for lost in tally.lost), tally.lost
 
 
-def test_memory_that_an_allocator_takes_once_is_no_leak(kept: list[object]) -> None:
+@pytest.mark.parametrize("when", range(6, 11))
+def test_memory_that_an_allocator_takes_once_is_no_leak(when: int) -> None:
     """At any time of the runs that are judged."""
-    for when in range(16, 30):
-        turns = iter(range(30))
-
-        def errand(when: int = when, turns: Iterator[int] = turns) -> None:
-            if next(turns) == when:
-                kept.append(np.ones(1_000_000))
-
-        tally = found(errand)
-        assert not any(lost.startswith("memory") for lost in tally.lost), (when, tally.lost)
+    tally = Tally()
+    memory = [100.0 + 8.0 * (k >= when) for k in range(11)]
+    samples = [Sample(3.0 * k, memory[k], 1000, 4, 2, 1, 0, 24, 12) for k in range(11)]
+    judge(samples, tally, unit="run", memory=1e-3, objects=0.5)
+    assert (tally.lost, tally.survived) == ([], 8)
 
 
 def test_a_thread_that_stays_is_lost(kept: list[object]) -> None:
