@@ -105,7 +105,7 @@ def test_a_stamped_tick_that_was_late_must_be_flagged_and_no_other(hung) -> None
 
 
 @pytest.mark.parametrize(
-    ("n_ticks", "part", "lost"), [(1500, 0.02, 0), (1500, 0.08, 1), (57, 0.035, 0), (57, 0.16, 1)]
+    ("n_ticks", "part", "lost"), [(1500, 0.02, 0), (1500, 0.04, 1), (490, 0.02, 0), (490, 0.04, 1)]
 )
 def test_deadlines_still_missed_after_a_load_are_lost(n_ticks: int, part: float, lost: int) -> None:
     t = np.arange(4000) / 1000

@@ -135,13 +135,9 @@ def recovery(trace: Trace, loads: list[tuple[float, float]], background: float) 
     wrong = []
     later = [begin for begin, _ in loads[1:]] + [math.inf]
     for (_, end), until in zip(loads, later, strict=True):
-        first, after = end + SETTLED_S, min(until, end + 2.0) - 0.01
-        n_ticks = np.count_nonzero((trace["t"] >= first) & (trace["t"] < after))
-        missed = missed_of(trace, first, after)
-        allowed = background + BACKGROUND
-        # Three standard deviations: of few ticks, between two loads, two may be late by chance.
-        if missed * n_ticks > allowed * n_ticks + 3.0 * math.sqrt(allowed * n_ticks):
-            wrong.append(f"after t = {end:.3f} s, {missed:.1%} of {n_ticks} ticks are still missed")
+        missed = missed_of(trace, end + SETTLED_S, min(until, end + 2.0) - 0.01)
+        if missed > background + BACKGROUND:
+            wrong.append(f"after t = {end:.3f} s, {missed:.1%} of ticks are still missed")
     return wrong
 
 
@@ -180,14 +176,14 @@ def interrupted(
 ) -> None:
     """The best priority there is, under load, and held up again and again from outside."""
     draw = random.Random(f"{name} {form.seed}")
-    run = Paced(0.001, form.pick(3.0, 20.0), draw.choice(["hold", "zero", "damped"]))
+    run = Paced(0.001, form.pick(3.5, 30.0), draw.choice(["hold", "zero", "damped"]))
     work = folder / name
     windows: list[tuple[int, int]] = []
     with run.running(work) as (process, start), load(folder):
         sleep_to(0.3, start)
         while (time.monotonic_ns() - start) * 1e-9 < run.duration - 1.5:
             windows.append(hold_up(process.pid, draw.uniform(0.05, 0.3)))
-            time.sleep(draw.uniform(0.35, 0.6))
+            time.sleep(draw.uniform(0.8, 1.1))  # of fewer ticks, two by chance would be 3 %
     trace = read_trace(work / "run.mcap")
     inside = accounts.within(windows, start, run.period, run.n_ticks)
     seconds = [((begin - start) * 1e-9, (end - start) * 1e-9) for begin, end in windows]
