@@ -70,6 +70,33 @@ def interrupted_once() -> Iterator[Callable[[], None]]:
         heard()
 
 
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Inside, Ctrl-C and SIGTERM wait for the end: for a library that they would break half-way.
+
+    A signal that Python does not handle does what it always does, and so does every one in another
+    thread than the first.
+    """
+    came: list[tuple[int, FrameType | None]] = []
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():
+        found = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+        handlers = {number: handler for number, handler in found.items() if callable(handler)}
+
+    def wait(number: int, frame: FrameType | None) -> None:
+        came.append((number, frame))
+
+    try:
+        for number in handlers:
+            signal.signal(number, wait)
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for what in came[:1]:
+            handlers[signal.Signals(what[0])](*what)
+
+
 def _tell_others(what: sys.UnraisableHookArgs) -> None:
     """What could not be raised is told, but for Ctrl-C, which is raised again."""
     if not issubclass(what.exc_type, KeyboardInterrupt):

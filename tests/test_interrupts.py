@@ -16,8 +16,9 @@ import pytest
 from listening import started
 
 from dnnmso_mj.cli.shared import progress_bar, working
+from dnnmso_mj.cli.watching import terminated_like_ctrl_c
 from dnnmso_mj.errors import RunInterrupted
-from dnnmso_mj.interrupts import heard, interrupted_once, raise_lost, remember_presses
+from dnnmso_mj.interrupts import heard, held_back, interrupted_once, raise_lost, remember_presses
 from dnnmso_mj.loading import load_scenario
 from dnnmso_mj.log.background import Background
 from dnnmso_mj.reading import log_info, read_trace
@@ -133,6 +134,29 @@ def test_the_first_raises_and_the_others_do_not():
         os.kill(os.getpid(), signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_what_must_not_be_broken_off_comes_to_its_end():
+    done = []
+
+    def work(number):
+        with held_back():
+            with held_back():
+                os.kill(os.getpid(), number)
+                os.kill(os.getpid(), number)
+            done.append(number)
+
+    with pytest.raises(KeyboardInterrupt):
+        work(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    with terminated_like_ctrl_c():
+        with pytest.raises(KeyboardInterrupt):
+            work(signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+    work(0)
+    assert done == [signal.SIGINT, signal.SIGTERM, 0]
 
 
 def press_in_vain(*_):

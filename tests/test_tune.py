@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy.engine.base import RootTransaction
 from sweep_samples import DNNMSO, children, dnnmso, wait_until
 
 from dnnmso_mj.errors import DnnmsoError, ScenarioError
@@ -209,6 +210,33 @@ def test_an_interrupted_search_comes_to_the_same_winner(undisturbed, tmp_path):
     assert not out.exists()
     done = tune(REQUEST, out, resume=True, jobs=1)
     assert done.kept == 3
+    assert trials(done.storage) == trials(undisturbed.storage)
+    assert done.parameters == undisturbed.parameters
+
+
+@pytest.mark.parametrize("at", [1, 41, 46, 51, 56])
+def test_a_ctrl_c_in_the_middle_of_a_commit_waits_for_its_end(
+    undisturbed, tmp_path, monkeypatch, at
+):
+    """Pressed for real where SQLAlchemy would make an AssertionError of it."""
+    finish, commits = RootTransaction._deactivate_from_connection, 0
+
+    def press(transaction):
+        nonlocal commits
+        commits += 1
+        if commits == at:
+            os.kill(os.getpid(), signal.SIGINT)
+        finish(transaction)
+
+    out = tmp_path / "x.yaml"
+    with monkeypatch.context() as patch:
+        patch.setattr(RootTransaction, "_deactivate_from_connection", press)
+        with pytest.raises(TuneInterrupted if at > 1 else KeyboardInterrupt) as stop:
+            tune(REQUEST, out, jobs=1)
+    assert default_storage(out).exists() == (at > 1), "a study without any trial is left"
+    if at > 1:
+        assert str(stop.value) == f"{len(trials(default_storage(out)))} trials are kept"
+    done = tune(REQUEST, out, resume=True, jobs=1)
     assert trials(done.storage) == trials(undisturbed.storage)
     assert done.parameters == undisturbed.parameters
 

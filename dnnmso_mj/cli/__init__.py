@@ -84,7 +84,7 @@ def _run() -> int:
         if error.filename is None and error.errno in FULL:
             return _refused_output(error)
         say("error", f"{error.filename or ''}: {error.strerror}")
-    except (RuntimeError, ImportError, SystemError) as error:
+    except Exception as error:
         if _interrupted(error):
             print("interrupted", file=sys.stderr)
             return INTERRUPTED
@@ -99,7 +99,7 @@ def _run() -> int:
 
 
 def _interrupted(error: BaseException | None) -> bool:
-    """Whether Ctrl-C is behind an error: libraries make others of it while they are imported."""
+    """Whether Ctrl-C is behind an error: libraries make others of it."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None

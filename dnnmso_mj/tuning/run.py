@@ -99,11 +99,11 @@ def tune(
         WorkerPool(LocalEngine(jobs).jobs) as pool,
         Study(storage, name, *trials, resume=resume, force=force) as study,
     ):
-        kept = study.n_done
-        _refuse_fewer(request.trials, kept, storage)
-        if watcher is not None:
-            watcher.begin(request.trials, kept)
         try:
+            kept = study.n_done
+            _refuse_fewer(request.trials, kept, storage)
+            if watcher is not None:
+                watcher.begin(request.trials, kept)
             while study.n_done < request.trials:
                 _one_trial(study, search, pool, watcher)
             best, parameters, value = study.best

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from dnnmso_mj.errors import MissingExtraError
 from dnnmso_mj.extras import pip_install
+from dnnmso_mj.interrupts import held_back
 from dnnmso_mj.sweep.journal import differences
 from dnnmso_mj.tuning import TuneError
 from dnnmso_mj.tuning.spaces import Space
@@ -68,13 +69,14 @@ class Study:
             raise TuneError(f"{path}: a study is there; {ways}")
         self._file = _lock(path)
         try:
-            found = self._open() if exists else None
-            if found is not None and force:
-                with path.open("r+b") as stream:
-                    stream.truncate()
-                found = None
-            self._study = found or self._new(name, definition)
-            self._check(definition)
+            with held_back():
+                found = self._open() if exists else None
+                if found is not None and force:
+                    with path.open("r+b") as stream:
+                        stream.truncate()
+                    found = None
+                self._study = found or self._new(name, definition)
+                self._check(definition)
         except BaseException:
             if not exists:
                 path.unlink(missing_ok=True)
@@ -130,7 +132,8 @@ class Study:
 
     def _done(self) -> list[optuna.trial.FrozenTrial]:
         complete = (self._optuna.trial.TrialState.COMPLETE,)
-        return self._study.get_trials(deepcopy=False, states=complete)
+        with held_back():
+            return self._study.get_trials(deepcopy=False, states=complete)
 
     def _rounded(self, params: Mapping[str, float]) -> Values:
         return {
@@ -207,12 +210,16 @@ def import_optuna() -> ModuleType:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """A database that cannot be written is one error, not the library's many."""
+    """A database that cannot be written is one error, not the library's many.
+
+    SQLAlchemy makes an AssertionError of a Ctrl-C in the middle of a commit: it waits.
+    """
     from optuna.exceptions import StorageInternalError
     from sqlalchemy.exc import SQLAlchemyError
 
     try:
-        yield
+        with held_back():
+            yield
     except (OSError, SQLAlchemyError, StorageInternalError) as error:
         cause = getattr(error, "orig", None) or error.__cause__ or error
         why = str(getattr(cause, "orig", None) or cause).splitlines()[0]
