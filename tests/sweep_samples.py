@@ -58,6 +58,18 @@ class DeadlyOnce(Scenario):
         return super().model_copy(update=update, deep=deep)
 
 
+class Parent(Scenario):
+    """A scenario whose runs start a process that outlasts them.
+
+    Its description names the file that has the process's number.
+    """
+
+    def model_copy(self, *, update: Any = None, deep: bool = False) -> Scenario:
+        sleeper = subprocess.Popen(["sleep", "600"])
+        Path(self.description).write_text(str(sleeper.pid))
+        return super().model_copy(update=update, deep=deep)
+
+
 def with_scenario(plan: Plan, kind: type[Scenario], **changes: Any) -> Plan:
     """The plan with every point's scenario as one of `kind`."""
     points = tuple(

@@ -21,10 +21,12 @@ from sweep_samples import (
     SMALL_SETS,
     Deadly,
     DeadlyOnce,
+    Parent,
     foreign_modules,
     rows_in,
     small_plan,
     untimed,
+    wait_until,
     with_scenario,
 )
 
@@ -62,6 +64,14 @@ def serial(plan, tmp_path_factory) -> pa.Table:
     """The table that one worker makes."""
     out = tmp_path_factory.mktemp("serial") / "one.parquet"
     return run_sweep(plan, out, LocalEngine(1)).table
+
+
+def is_there(process: int) -> bool:
+    """Whether it runs; a process that has ended and that nobody has waited for does not."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 class Shuffled(LocalEngine):
@@ -275,6 +285,17 @@ def test_a_run_whose_process_was_killed_once_is_run_again(plan, serial, tmp_path
     table = run_sweep(once, tmp_path / "x.parquet", InOneTask(1)).table
     assert Path(memory).exists()
     assert untimed(table).equals(untimed(serial).slice(0, 10))
+
+
+def test_a_worker_that_is_ended_takes_along_what_it_has_started(plan, tmp_path, importable):
+    known = tmp_path / "process"
+    point = with_scenario(plan, Parent, description=str(known)).points[0]
+    rows = LocalEngine(1).rows([Task(0, point.scenario, point.mjcf, (0, 1))])
+    assert next(rows)["status"] == "ok"
+    process = int(known.read_text())
+    assert is_there(process)
+    rows.close()
+    wait_until(lambda: not is_there(process))
 
 
 def test_workers_that_cannot_start_are_an_error_not_an_endless_loop(plan, tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import gc
 import os
+import signal
 import sys
 import warnings
 from io import TextIOWrapper
@@ -64,6 +65,7 @@ def main() -> NoReturn:
             sys.stdout.flush()
     except OSError as error:
         status = _refused_output(error)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done and said
     gc.freeze()  # nothing is left to collect that the end of the process would not free
     sys.exit(status)
 

@@ -200,7 +200,8 @@ class _Worker:
 
     def kill(self) -> None:
         self.pipe.close()
-        self._process.kill()
+        if self._process.poll() is None:  # with what it has started, in its session of its own
+            os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
     @property

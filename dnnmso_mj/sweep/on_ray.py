@@ -14,6 +14,7 @@ from types import ModuleType
 from typing import Any
 
 from dnnmso_mj.errors import MissingExtraError
+from dnnmso_mj.interrupts import held_back
 from dnnmso_mj.provenance import software_versions
 from dnnmso_mj.sources import PACKAGE, sources_digest
 from dnnmso_mj.sweep.plan import NUMBERS_DEPEND_ON, SweepError
@@ -144,21 +145,27 @@ def _connected(ray: ModuleType, address: str | None, jobs: int | None) -> Iterat
         options |= {"address": address}
     with _on_loopback(ray) if address is None else nullcontext():
         try:
-            _check_reachable(address)
-            # Ray puts the folder of this moment first where its workers import from: let it be the
-            # one that this code came from, not whatever the caller stands in.
-            with chdir(PACKAGE.parent):
-                ray.init(**options)
-        except Exception as error:  # of no kind of its own where its processes start too slowly
-            where = "this machine" if address is None else f"--address {clean(address)}"
-            start = "allowed: auto or HOST:PORT of a cluster that `ray start --head` has started"
-            raise SweepError(f"{where}: no Ray there: {clean(str(error))}; {start}") from error
-        try:
+            _start(ray, address, options)
             if address is None:
                 _check_alone(ray.util.get_node_ip_address())
             yield
         finally:
-            ray.shutdown()
+            with held_back():
+                ray.shutdown()
+
+
+def _start(ray: ModuleType, address: str | None, options: dict[str, Any]) -> None:
+    try:
+        _check_reachable(address)
+        # Ray puts the folder of this moment first where its workers import from: let it be the
+        # one that this code came from, not whatever the caller stands in. Broken off while it
+        # starts, it may end in a segmentation fault.
+        with chdir(PACKAGE.parent), held_back() if address is None else nullcontext():
+            ray.init(**options)
+    except Exception as error:  # of no kind of its own where its processes start too slowly
+        where = "this machine" if address is None else f"--address {clean(address)}"
+        start = "allowed: auto or HOST:PORT of a cluster that `ray start --head` has started"
+        raise SweepError(f"{where}: no Ray there: {clean(str(error))}; {start}") from error
 
 
 @contextmanager
