@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from sqlalchemy.engine.base import RootTransaction
 from sweep_samples import DNNMSO, children, dnnmso, wait_until
@@ -341,6 +342,49 @@ def test_an_untuned_controller_that_cannot_run_is_an_error(tmp_path):
     with pytest.raises(ScenarioError, match="no model"):
         tune(replace(REQUEST, sets=("plant.model=nowhere",)), tmp_path / "x.yaml")
     assert list(tmp_path.iterdir()) == []
+
+
+CORRUPTIONS = {
+    "a value": "UPDATE trial_values SET value = value / 2 WHERE trial_id = 2",
+    "a parameter": "UPDATE trial_params SET param_value = 9.5 WHERE trial_id = 2",
+    "a parameter's name": "UPDATE trial_params SET param_name = 'inversion.lbm' "
+    "WHERE trial_id = 2 AND param_name = 'inversion.lam'",
+    "a state": "UPDATE trials SET state = 'COMPLE E' WHERE trial_id = 2",
+    "what is tuned": "UPDATE study_user_attributes SET value_json = '{' || value_json",
+    "a distribution": "UPDATE trial_params SET distribution_json = '{}'",
+    "no value": "DELETE FROM trial_values WHERE trial_id = 2",
+}
+
+
+@pytest.mark.parametrize("statement", CORRUPTIONS.values(), ids=CORRUPTIONS)
+def test_a_damaged_study_is_one_error(undisturbed, tmp_path, statement):
+    storage = tmp_path / "x.sqlite"
+    storage.write_bytes(undisturbed.storage.read_bytes())
+    with sqlite3.connect(storage) as connection:
+        assert connection.execute(statement).rowcount > 0
+    connection.close()
+    with pytest.raises(TuneError) as caught:
+        tune(REQUEST, tmp_path / "x.yaml", storage, resume=True, jobs=1)
+    assert f"{storage}: the study is damaged: " in str(caught.value)
+    assert str(caught.value).endswith("allowed: another --storage, or remove it first")
+    assert not (tmp_path / "x.yaml").exists()
+
+
+def test_a_study_of_any_flipped_bits_is_one_error_or_the_same_winner(undisturbed, tmp_path):
+    rng = np.random.default_rng(0)
+    storage, out, whole = tmp_path / "x.sqlite", tmp_path / "x.yaml", undisturbed.storage
+    refused = 0
+    for _ in range(40):
+        content = bytearray(whole.read_bytes())
+        for at in rng.integers(0, len(content), 20):
+            content[at] ^= 1 << rng.integers(0, 8)
+        storage.write_bytes(content)
+        try:
+            done = tune(REQUEST, out, storage, resume=True, jobs=1)
+            assert done.parameters == undisturbed.parameters
+        except TuneError:
+            refused += 1
+    assert 0 < refused < 40
 
 
 # The command

@@ -7,6 +7,7 @@ makes the same trials as one that was not.
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -15,17 +16,19 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self
 
-from dnnmso_mj.errors import MissingExtraError
+from dnnmso_mj.errors import DnnmsoError, MissingExtraError
 from dnnmso_mj.extras import pip_install
 from dnnmso_mj.interrupts import held_back
 from dnnmso_mj.sweep.journal import differences
 from dnnmso_mj.tuning import TuneError
 from dnnmso_mj.tuning.spaces import Space
+from dnnmso_mj.wording import clean
 
 if TYPE_CHECKING:
     import optuna
 
 ATTRIBUTE = "dnnmso_tune"  # of a study: what it tunes
+DIGEST = "sha256"  # of a trial: what was tried, and its value
 SAMPLER_SEED = 0
 DIGITS = 4  # of a value that is tried, so that what is written is what was tried
 LISTED = 8
@@ -70,13 +73,15 @@ class Study:
         self._file = _lock(path)
         try:
             with held_back():
-                found = self._open() if exists else None
+                with _reading(path):
+                    found = self._open() if exists else None
                 if found is not None and force:
                     with path.open("r+b") as stream:
                         stream.truncate()
                     found = None
                 self._study = found or self._new(name, definition)
-                self._check(definition)
+                with _reading(path):
+                    self._check(definition)
         except BaseException:
             if not exists:
                 path.unlink(missing_ok=True)
@@ -128,6 +133,8 @@ class Study:
         """Keep a trial's value; None: it was interrupted, and does not count."""
         state = self._optuna.trial.TrialState.FAIL if value is None else None
         with _writing(self._path):
+            if value is not None:
+                trial.set_user_attr(DIGEST, _digest(trial.params, value))
             self._study.tell(trial, value, state=state)
 
     def _done(self) -> list[optuna.trial.FrozenTrial]:
@@ -179,6 +186,9 @@ class Study:
         return study
 
     def _check(self, definition: dict[str, Any]) -> None:
+        for trial in self._done():
+            if trial.user_attrs.get(DIGEST) != _digest(trial.params, trial.value):
+                raise ValueError(f"trial {trial.number} is not what was written")
         before = json.loads(self._study.user_attrs[ATTRIBUTE])
         found = list(differences(before, json.loads(json.dumps(definition)), ""))
         if found:
@@ -208,6 +218,11 @@ def import_optuna() -> ModuleType:
     return module
 
 
+def _digest(params: Mapping[str, float], value: float | None) -> str:
+    """SQLite does not notice a bit that a disk has flipped."""
+    return hashlib.sha256(json.dumps([sorted(params.items()), value]).encode()).hexdigest()
+
+
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
     """A database that cannot be written is one error, not the library's many.
@@ -225,6 +240,21 @@ def _writing(path: Path) -> Iterator[None]:
         why = str(getattr(cause, "orig", None) or cause).splitlines()[0]
         raise TuneError(
             f"{path}: cannot be written: {why}; finished trials are kept; --resume goes on"
+        ) from error
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """A damaged study is one error, whatever the libraries stumble over."""
+    try:
+        yield
+    except DnnmsoError:
+        raise
+    except Exception as error:
+        why = (str(getattr(error, "orig", None) or error).splitlines() or [""])[0]
+        raise TuneError(
+            f"{path}: the study is damaged: {type(error).__name__}: {clean(why)}; allowed: another "
+            "--storage, or remove it first"
         ) from error
 
 
