@@ -85,4 +85,5 @@ def test_the_page_is_made_of_the_results() -> None:
 
 def test_all_rows_together_end_within_two_hours() -> None:
     assert [row.number for row in ROWS] == list(range(1, 16))
-    assert sum(row.limit_s for row in ROWS) < 7200
+    compiling = 300.0
+    assert compiling + sum(row.limit_s for row in ROWS) <= 7200
