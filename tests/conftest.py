@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import math
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -20,6 +21,10 @@ from dnnmso_mj.scenario import Scenario
 
 ROOT = Path(__file__).parents[1]
 LOCKS = "DNNMSO_TEST_LOCKS"
+
+# Started in a shell's background all programs would ignore the Ctrl-C that tests send them.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Workers share the cores: torch's threads would wait for one another.
 os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -20,6 +20,8 @@ def main() -> int:
     """Run rows one after the other; 1 if anything was lost or let in."""
     arguments = _arguments()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # what was begun ends
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # of a shell's background job
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # rows press Ctrl-C in programs
     form = Form(long=not arguments.short, seed=arguments.seed)
     if arguments.into:
         with tempfile.TemporaryDirectory(prefix="dnnmso-soak-") as folder:
