@@ -36,11 +36,11 @@ help:
 run: $(VENV)/.installed-run
 	$(BIN)/dnnmso run $(SCENARIO)
 
-test: $(VENV)/.installed-test
+test: $(VENV)/.installed-check
 	$(BIN)/python -m pytest --numprocesses logical --dist loadfile --no-loadscope-reorder \
 	  $(PYTEST_ARGS)
 
-soak: $(VENV)/.installed-test
+soak: $(VENV)/.installed-check
 	PYTHONPATH=tests $(BIN)/python -m soak $(SOAK_ARGS)
 
 golden: $(VENV)/.installed-test
