@@ -87,14 +87,15 @@ def held_back() -> Iterator[None]:
         came.append((number, frame))
 
     try:
-        for number in handlers:
-            signal.signal(number, wait)
+        for kind in handlers:
+            signal.signal(kind, wait)
         yield
     finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        for what in came[:1]:
-            handlers[signal.Signals(what[0])](*what)
+        for kind, handler in handlers.items():
+            signal.signal(kind, handler)
+        if came:
+            number, frame = came[0]
+            handlers[signal.Signals(number)](number, frame)
 
 
 def _tell_others(what: sys.UnraisableHookArgs) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -99,6 +100,19 @@ def test_a_machine_with_other_software_ends_the_sweep_and_keeps_its_rows(
     monkeypatch.setattr(on_ray, "_versions", lambda: {"mujoco": "3.0.0"})
     with pytest.raises(DnnmsoError, match=r"has dnnmso_mj .*; allowed: .* mujoco 3\.0\.0"):
         run_sweep(small_plan(), tmp_path / "x.parquet", RayEngine(address=cluster.address))
+
+
+def test_ray_that_the_caller_has_started_is_left_alone(cluster):
+    import ray
+
+    point = small_plan().points[0]
+    ray.init(address=cluster.address, log_to_driver=False, logging_level=logging.ERROR)
+    try:
+        with pytest.raises(DnnmsoError, match="this machine: no Ray there"):
+            next(RayEngine().rows([Task(0, point.scenario, point.mjcf, (0,))]))
+        assert ray.is_initialized()
+    finally:
+        ray.shutdown()
 
 
 def test_every_row_is_there_although_a_node_is_killed_in_mid_sweep(cluster, tmp_path):

@@ -70,7 +70,7 @@ def is_there(process: int) -> bool:
     """Whether it runs; a process that has ended and that nobody has waited for does not."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
+    except (FileNotFoundError, ProcessLookupError):
         return False
 
 

@@ -144,23 +144,27 @@ def _connected(ray: ModuleType, address: str | None, jobs: int | None) -> Iterat
     else:
         options |= {"address": address}
     with _on_loopback(ray) if address is None else nullcontext():
+        ours = False  # not one that the caller has started, which Ray then refuses to start again
         try:
-            _start(ray, address, options)
+            # Broken off while it starts, Ray may end in a segmentation fault.
+            with held_back() if address is None else nullcontext():
+                _start(ray, address, options)
+                ours = True
             if address is None:
                 _check_alone(ray.util.get_node_ip_address())
             yield
         finally:
-            with held_back():
-                ray.shutdown()
+            if ours:
+                with held_back():
+                    ray.shutdown()
 
 
 def _start(ray: ModuleType, address: str | None, options: dict[str, Any]) -> None:
     try:
         _check_reachable(address)
         # Ray puts the folder of this moment first where its workers import from: let it be the
-        # one that this code came from, not whatever the caller stands in. Broken off while it
-        # starts, it may end in a segmentation fault.
-        with chdir(PACKAGE.parent), held_back() if address is None else nullcontext():
+        # one that this code came from, not whatever the caller stands in.
+        with chdir(PACKAGE.parent):
             ray.init(**options)
     except Exception as error:  # of no kind of its own where its processes start too slowly
         where = "this machine" if address is None else f"--address {clean(address)}"
